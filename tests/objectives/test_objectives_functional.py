@@ -1,0 +1,125 @@
+from __future__ import annotations
+
+import math
+
+import mpmath
+import pytest
+import torch
+from scipy import stats
+from torch.distributions import MultivariateNormal, kl_divergence
+
+from torchrl_safe.objectives.functional import (
+    cvar_factor,
+    discounted_cost_limit,
+    gaussian_cvar,
+    moment_matched_kl,
+    q_logarithm,
+    uniform_tsallis_entropy,
+)
+
+
+def exact_q_logarithm(log_prob: float, entropic_index: float) -> float:
+    with mpmath.workdps(60):
+        density, order = mpmath.exp(mpmath.mpf(log_prob)), mpmath.mpf(entropic_index) - 1
+        return float(mpmath.log(density) if order == 0 else (density**order - 1) / order)
+
+
+class TestQLogarithm:
+    @pytest.mark.parametrize(
+        "entropic_index", [0.3, 0.9, 1 - 1e-9, 1.0, 1 + 1e-12, 1 + 1e-6, 1.2, 1.4, 2.0, 3.0]
+    )
+    def test_arbitrary_precision(self, entropic_index):
+        log_prob = [-14.0, -7.3, -1.0, -1e-8, 0.0, 1e-3, 1.7, 4.9]
+        expected = [exact_q_logarithm(x, entropic_index) for x in log_prob]
+        actual = q_logarithm(torch.tensor(log_prob, dtype=torch.float64), entropic_index)
+        torch.testing.assert_close(
+            actual, torch.tensor(expected, dtype=torch.float64), rtol=1e-12, atol=1e-15
+        )
+
+    @pytest.mark.parametrize("entropic_index", [0.5, 1.0, 1.4, 2.0])
+    def test_derivative_is_a_power_of_the_density(self, entropic_index):
+        log_prob = torch.linspace(-5, 4, 31, dtype=torch.float64, requires_grad=True)
+        (grad,) = torch.autograd.grad(q_logarithm(log_prob, entropic_index).sum(), log_prob)
+        # d ln_q(x) / d log(x) = x^(q-1)
+        torch.testing.assert_close(grad, log_prob.exp().pow(entropic_index - 1).detach())
+
+    def test_bounded_and_increasing_at_huge_densities(self):
+        log_prob = torch.tensor([9.0, 11.0, 100.0, 1e6], requires_grad=True)
+        value = q_logarithm(log_prob, 2.0)
+        (grad,) = torch.autograd.grad(value.sum(), log_prob)
+        assert value.isfinite().all()
+        assert (value.diff() > 0).all()
+        assert grad.max() <= math.exp(10) * (1 + 1e-6)
+        assert grad.min() > 0
+
+    @pytest.mark.parametrize("entropic_index", [0.0, -1.0, math.nan, math.inf])
+    def test_bad_index(self, entropic_index):
+        with pytest.raises(ValueError, match=r"entropic_index must be .* got"):
+            q_logarithm(torch.zeros(1), entropic_index)
+
+    def test_tsallis_entropy_of_a_uniform_density(self):
+        # Density 1/4 on a volume of 4: S_2 = -E[1/4 - 1].
+        assert uniform_tsallis_entropy(math.log(4), 2.0) == pytest.approx(0.75)
+        assert uniform_tsallis_entropy(-3.0, 1.0) == -3.0
+
+
+class TestCVaR:
+    @pytest.mark.parametrize(
+        ("risk_level", "expected"), [(0.125, 1.6468), (0.25, 1.2711), (0.5, 0.7979), (1.0, 0.0)]
+    )
+    def test_factor_of_the_paper(self, risk_level, expected):
+        assert cvar_factor(risk_level) == pytest.approx(expected, abs=5e-5)
+
+    @pytest.mark.parametrize("risk_level", [0.01, 0.125, 0.7, 0.999])
+    def test_factor_by_quadrature(self, risk_level):
+        threshold = stats.norm.ppf(1 - risk_level)
+        tail = stats.norm.expect(lambda x: x, lb=threshold) / risk_level
+        assert cvar_factor(risk_level) == pytest.approx(tail, rel=1e-6)
+
+    def test_mean_of_the_worst_samples(self):
+        torch.manual_seed(0)
+        draws = (3.0 + 2.0 * torch.randn(2_000_000, dtype=torch.float64)).sort(descending=True)[0]
+        worst = draws[: len(draws) // 8].mean()
+        actual = gaussian_cvar(torch.tensor(3.0), torch.tensor(2.0), risk_level=0.125)
+        assert actual.item() == pytest.approx(worst.item(), rel=2e-3)
+
+    @pytest.mark.parametrize("risk_level", [0.0, -0.1, 1.01, math.nan])
+    def test_bad_risk_level(self, risk_level):
+        with pytest.raises(ValueError, match=r"risk_level must be in \(0, 1\], got"):
+            gaussian_cvar(torch.zeros(1), torch.ones(1), risk_level)
+
+
+class TestUnits:
+    def test_limit_is_the_discounted_sum_of_a_constant_cost(self):
+        gamma, rate = 0.97, 0.04
+        total = sum(rate * gamma**t for t in range(3_000))
+        assert discounted_cost_limit(rate, gamma) == pytest.approx(total)
+
+    @pytest.mark.parametrize(
+        ("rate", "gamma"), [(-1.0, 0.9), (math.nan, 0.9), (1.0, 1.0), (1.0, -0.1)]
+    )
+    def test_bad_arguments(self, rate, gamma):
+        with pytest.raises(ValueError, match="must be"):
+            discounted_cost_limit(rate, gamma)
+
+
+class TestMomentMatchedKL:
+    def test_multivariate_normal(self):
+        torch.manual_seed(0)
+        mean = torch.randn(2, 7, 3, dtype=torch.float64)
+        root = torch.randn(2, 7, 3, 3, dtype=torch.float64)
+        cov = root @ root.mT + 0.1 * torch.eye(3, dtype=torch.float64)
+        expected = kl_divergence(
+            MultivariateNormal(mean[0], cov[0]), MultivariateNormal(mean[1], cov[1])
+        )
+        torch.testing.assert_close(moment_matched_kl(mean[0], cov[0], mean[1], cov[1]), expected)
+
+    def test_zero_with_zero_gradient_at_equality(self):
+        mean = torch.randn(5, 2, dtype=torch.float64)
+        cov = torch.eye(2, dtype=torch.float64).expand(5, 2, 2) * 0.3
+        new_mean, new_cov = mean.clone().requires_grad_(), cov.clone().requires_grad_()
+        kl = moment_matched_kl(mean, cov, new_mean, new_cov)
+        grads = torch.autograd.grad(kl.sum(), (new_mean, new_cov))
+        torch.testing.assert_close(kl, torch.zeros_like(kl))
+        for grad in grads:
+            torch.testing.assert_close(grad, torch.zeros_like(grad))

@@ -1,0 +1,308 @@
+from __future__ import annotations
+
+import math
+from copy import deepcopy
+
+import pytest
+import torch
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModule
+from torch import nn
+from torchrl.data import Bounded
+from torchrl.modules import MLP, NormalParamExtractor, ProbabilisticActor, TanhNormal, ValueOperator
+from torchrl.objectives import SACLoss, SoftUpdate, ValueEstimators
+
+from torchrl_safe import GMMTanhPolicy, TsallisLoss
+from torchrl_safe.modules import GMMParamExtractor
+
+OBS, ACT = 3, 2
+
+
+def make_actor(spec):
+    net = nn.Sequential(MLP(OBS, 2 * ACT, num_cells=[16]), NormalParamExtractor())
+    return ProbabilisticActor(
+        TensorDictModule(net, in_keys=["observation"], out_keys=["loc", "scale"]),
+        in_keys=["loc", "scale"],
+        spec=spec,
+        distribution_class=TanhNormal,
+        return_log_prob=True,
+    )
+
+
+def make_mixture(spec):
+    net = MLP(OBS, GMMParamExtractor(3, ACT).num_features, num_cells=[16])
+    return GMMTanhPolicy(net, spec, num_components=3)
+
+
+def make_qvalue(out_key="state_action_value"):
+    net = MLP(OBS + ACT, 1, num_cells=[16])
+    return ValueOperator(net, in_keys=["observation", "action"], out_keys=[out_key])
+
+
+def make_data(batch=(8,), dtype=torch.float64):
+    generator = torch.Generator().manual_seed(3)
+
+    def rand(*shape):
+        return torch.randn(*batch, *shape, generator=generator, dtype=dtype)
+
+    flag = torch.zeros(*batch, 1, dtype=torch.bool)
+    terminated = flag.clone()
+    terminated[0] = True
+    return TensorDict(
+        {
+            "observation": rand(OBS),
+            "action": rand(ACT).tanh(),
+            "action_log_prob": rand(),
+            "next": {
+                "observation": rand(OBS),
+                "reward": rand(1),
+                "done": terminated.clone(),
+                "terminated": terminated,
+            },
+        },
+        batch_size=batch,
+    )
+
+
+@pytest.fixture
+def blocks():
+    torch.manual_seed(0)
+    spec = Bounded(-1, 1, (ACT,), dtype=torch.float64)
+    return make_actor(spec).double(), make_qvalue().double()
+
+
+class TestEqualsSAC:
+    @pytest.mark.parametrize("td_est", [ValueEstimators.TD0, ValueEstimators.TDLambda])
+    @pytest.mark.parametrize("fixed_alpha", [True, False])
+    @pytest.mark.parametrize("delay_qvalue", [True, False])
+    @pytest.mark.parametrize("loss_function", ["l2", "smooth_l1"])
+    def test_losses_and_gradients(self, blocks, td_est, fixed_alpha, delay_qvalue, loss_function):
+        actor, qvalue = blocks
+        common = {
+            "alpha_init": 0.3,
+            "fixed_alpha": fixed_alpha,
+            "delay_qvalue": delay_qvalue,
+            "loss_function": loss_function,
+        }
+        results = []
+        for kind, extra in ((SACLoss, {}), (TsallisLoss, {"entropic_index": 1.0})):
+            torch.manual_seed(1)
+            loss = kind(deepcopy(actor), deepcopy(qvalue), **common, **extra)
+            if delay_qvalue:
+                SoftUpdate(loss, eps=0.99)
+            loss.make_value_estimator(td_est, gamma=0.9)
+            torch.manual_seed(2)
+            out = loss(make_data((4, 6)))
+            sum(value for key, value in out.items() if key.startswith("loss_")).backward()
+            grads = {name: p.grad for name, p in loss.named_parameters()}
+            results.append((out, grads))
+        (sac, sac_grads), (tsallis, tsallis_grads) = results
+        assert set(sac.keys()) == set(tsallis.keys())
+        for key in sac.keys():
+            torch.testing.assert_close(tsallis[key], sac[key], rtol=1e-6, atol=1e-6)
+        assert sac_grads.keys() == tsallis_grads.keys()
+        assert any(grad is not None and grad.abs().max() > 0 for grad in sac_grads.values())
+        for name, grad in sac_grads.items():
+            torch.testing.assert_close(tsallis_grads[name], grad, rtol=1e-6, atol=1e-6)
+
+    def test_target_entropy(self, blocks):
+        actor, qvalue = blocks
+        assert TsallisLoss(actor, qvalue, entropic_index=1.0).target_entropy == -ACT
+        # S_2 of the uniform density whose Shannon entropy is -ACT, a density of exp(ACT).
+        target = TsallisLoss(actor, qvalue, entropic_index=2.0).target_entropy
+        assert target.item() == pytest.approx(1 - math.exp(ACT), rel=1e-6)
+        assert TsallisLoss(
+            actor, qvalue, target_entropy=-0.7
+        ).target_entropy.item() == pytest.approx(-0.7)
+
+
+class TestEquations:
+    @pytest.mark.parametrize("q", [0.5, 1.3, 2.0])
+    def test_target_is_the_bellman_equation(self, blocks, q):
+        actor, qvalue = blocks
+        loss = TsallisLoss(
+            actor, qvalue, entropic_index=q, alpha_init=0.3, fixed_alpha=True, delay_qvalue=False
+        )
+        loss.make_value_estimator(ValueEstimators.TD0, gamma=0.9)
+        data = make_data()
+        torch.manual_seed(5)
+        target = loss.compute_target(data)
+
+        torch.manual_seed(5)
+        dist = actor.get_dist(data["next"])
+        action, log_prob = dist.sample_and_log_prob()
+        inputs = torch.cat([data["next", "observation"], action], -1)
+        values = []
+        for index in range(2):
+            with loss.qvalue_network_params[index].to_module(qvalue):
+                values.append(qvalue.module(inputs))
+        density = log_prob.exp()
+        entropy_term = 0.3 * (density ** (q - 1) - 1) / (q - 1)
+        value = torch.minimum(*values) - entropy_term.unsqueeze(-1)
+        expected = data["next", "reward"] + 0.9 * (~data["next", "terminated"]) * value
+        torch.testing.assert_close(target, expected.detach())
+        assert not target.requires_grad
+
+    def test_objective_is_minus_the_actor_loss(self, blocks):
+        actor, qvalue = blocks
+        loss = TsallisLoss(actor, qvalue, entropic_index=1.4, alpha_init=0.2, delay_qvalue=False)
+        data = make_data()
+        torch.manual_seed(5)
+        expected, _ = loss.actor_loss(data)
+        torch.manual_seed(5)
+        action, log_prob = actor.get_dist(data).rsample_and_log_prob()
+        objective = loss.objective(data, action, log_prob).mean()
+        torch.testing.assert_close(objective, -expected)
+        objective.backward()
+        assert all(p.grad is not None for p in actor.parameters())
+        assert all(p.grad is None for p in loss.qvalue_network_params.parameters())
+
+    def test_alpha_raises_too_low_an_entropy(self, blocks):
+        actor, qvalue = blocks
+        for target, sign in ((1e3, -1), (-1e3, 1)):
+            loss = TsallisLoss(
+                actor, qvalue, entropic_index=1.4, target_entropy=target, delay_qvalue=False
+            )
+            loss(make_data())["loss_alpha"].backward()
+            # Gradient descent: a negative gradient raises the weight.
+            assert loss.log_alpha.grad.sign() == sign
+
+
+class TestLossModule:
+    def test_gradient_isolation(self, blocks):
+        loss = TsallisLoss(*blocks, delay_qvalue=False)
+        out = loss(make_data())
+        owners = {
+            "loss_actor": "actor_network_params",
+            "loss_qvalue": "qvalue_network_params",
+            "loss_alpha": "log_alpha",
+        }
+        for key, owner in owners.items():
+            loss.zero_grad()
+            out[key].backward(retain_graph=True)
+            touched = {
+                name.split(".")[0]
+                for name, p in loss.named_parameters()
+                if p.grad is not None and p.grad.abs().max() > 0
+            }
+            assert touched == {owner}
+
+    def test_precomputed_target(self, blocks):
+        loss = TsallisLoss(*blocks, delay_qvalue=False)
+        data = make_data()
+        torch.manual_seed(0)
+        expected, _ = loss.qvalue_v2_loss(data)
+        torch.manual_seed(0)
+        data["value_target"] = loss.compute_target(data)
+        flat = data.select("observation", "action", "value_target")
+        torch.testing.assert_close(loss.qvalue_v2_loss(flat)[0], expected)
+
+    def test_vmap_and_loop_agree(self, blocks):
+        torch.manual_seed(1)
+        loss = TsallisLoss(*blocks, delay_qvalue=False)
+        torch.manual_seed(1)
+        looped = TsallisLoss(*blocks, delay_qvalue=False, deactivate_vmap=True)
+        looped.load_state_dict(loss.state_dict())
+        for module in (loss, looped):
+            torch.manual_seed(2)
+            module.out = module(make_data())
+        for key in loss.out.keys():
+            torch.testing.assert_close(loss.out[key], looped.out[key])
+
+    def test_skip_done_states(self, blocks):
+        loss = TsallisLoss(*blocks, delay_qvalue=False, skip_done_states=True)
+        data = make_data()
+        data["next", "observation"][0] = torch.nan
+        out = loss(data)
+        assert out["loss_qvalue"].isfinite()
+
+    @pytest.mark.filterwarnings("ignore:SACLoss with reduction")
+    def test_reduction_none(self, blocks):
+        loss = TsallisLoss(*blocks, delay_qvalue=False, reduction="none")
+        out = loss(make_data())
+        assert out["loss_actor"].shape == out["loss_qvalue"].shape == (8,)
+
+    def test_priority_weights(self, blocks):
+        loss = TsallisLoss(*blocks, delay_qvalue=False)
+        data = make_data()
+        data["value_target"] = loss.compute_target(data)
+        data["priority_weight"] = torch.zeros(8)
+        data["priority_weight"][2] = 1.0
+        weighted, _ = loss.qvalue_v2_loss(data)
+        single, _ = loss.qvalue_v2_loss(data[2:3].exclude("priority_weight"))
+        torch.testing.assert_close(weighted, single)
+
+    def test_keys(self, blocks):
+        actor, _ = blocks
+        qvalue = make_qvalue("other_value").double()
+        loss = TsallisLoss(actor, qvalue, delay_qvalue=False)
+        loss.set_keys(
+            state_action_value="other_value", reward="bonus", value_target=("my", "target")
+        )
+        loss.make_value_estimator(ValueEstimators.TD0, gamma=0.9)
+        data = make_data()
+        data["next", "bonus"] = data["next"].pop("reward")
+        assert loss(data)["loss_qvalue"].isfinite()
+        data["my", "target"] = torch.zeros(8, 1, dtype=torch.float64)
+        prediction = loss._vmap_qnetworkN0(data, loss.qvalue_network_params)["other_value"]
+        expected = prediction.square().sum(0).mean()
+        torch.testing.assert_close(loss.qvalue_v2_loss(data)[0], expected)
+
+    def test_state_dict(self, blocks):
+        loss = TsallisLoss(*blocks)
+        other = TsallisLoss(*(deepcopy(block) for block in blocks))
+        other.load_state_dict(loss.state_dict())
+        for name, value in loss.state_dict().items():
+            torch.testing.assert_close(other.state_dict()[name], value)
+
+    def test_mixture(self):
+        torch.manual_seed(0)
+        spec = Bounded(-1, 1, (ACT,))
+        loss = TsallisLoss(make_mixture(spec), make_qvalue(), delay_qvalue=False)
+        out = loss(make_data(dtype=torch.float32))
+        (out["loss_actor"] + out["loss_qvalue"] + out["loss_alpha"]).backward()
+        assert all(p.grad.isfinite().all() for p in loss.parameters())
+
+    def test_retrace(self, blocks):
+        loss = TsallisLoss(*blocks, delay_qvalue=False)
+        loss.make_value_estimator("retrace", gamma=0.9, lmbda=0.0)
+        data = make_data((4, 6))
+        torch.manual_seed(5)
+        actual = loss.compute_target(data)
+        loss.make_value_estimator(ValueEstimators.TD0, gamma=0.9)
+        torch.manual_seed(5)
+        torch.testing.assert_close(actual, loss.compute_target(data))
+
+    @pytest.mark.filterwarnings(
+        "ignore:.*inline_inbuilt_nn_modules:FutureWarning",
+        "ignore:.*autograd.Function:DeprecationWarning",
+    )
+    def test_compiles(self, blocks):
+        loss = TsallisLoss(*blocks, delay_qvalue=False, fixed_alpha=True, alpha_init=0.1)
+        data = make_data()
+        data["value_target"] = loss.compute_target(data)
+        compiled = torch.compile(lambda td: loss.qvalue_v2_loss(td)[0], backend="eager")
+        torch.testing.assert_close(compiled(data), loss.qvalue_v2_loss(data)[0])
+
+
+class TestMisuse:
+    @pytest.mark.parametrize("q", [0.0, -2.0, math.nan, math.inf])
+    def test_entropic_index(self, blocks, q):
+        with pytest.raises(ValueError, match="entropic_index must be"):
+            TsallisLoss(*blocks, entropic_index=q)
+
+    def test_num_qvalue_nets(self, blocks):
+        with pytest.raises(ValueError, match="num_qvalue_nets must be at least 1, got 0"):
+            TsallisLoss(*blocks, num_qvalue_nets=0)
+
+    def test_alpha(self, blocks):
+        with pytest.raises(ValueError, match=r"alpha_init must be positive, got -1"):
+            TsallisLoss(*blocks, alpha_init=-1.0)
+
+    def test_log_prob_shape(self, blocks):
+        loss = TsallisLoss(*blocks, delay_qvalue=False)
+        data = make_data()
+        with pytest.raises(
+            ValueError, match=r"log_prob and the critic's value .* \(8, 1\) and \(8,\)"
+        ):
+            loss.objective(data, data["action"], data["action_log_prob"].unsqueeze(-1))

@@ -1,0 +1,746 @@
+"""The estimator: what it reads and computes, alone and inside TorchRL's losses."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable
+
+import pytest
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import NormalParamExtractor, TensorDictModule
+from torch import Tensor, nn
+from torchrl.data import (
+    Bounded,
+    LazyTensorStorage,
+    SliceSampler,
+    TensorDictReplayBuffer,
+)
+from torchrl.modules import MLP, ProbabilisticActor, TanhNormal, ValueOperator
+from torchrl.objectives import DDPGLoss, DQNLoss, LossModule, SACLoss, SoftUpdate, TD3Loss
+from torchrl.objectives.value import TD0Estimator
+
+from torchrl_safe.objectives.value import RetraceEstimator, retrace_lambda_return_estimate
+
+GAMMA, LMBDA = 0.99, 0.9
+OBS, ACT = 3, 2
+
+
+@pytest.fixture(autouse=True)
+def _seed() -> None:
+    torch.manual_seed(0)
+
+
+def make_actor(observation="observation", action="action") -> ProbabilisticActor:
+    net = nn.Sequential(MLP(OBS, 2 * ACT, num_cells=[8]), NormalParamExtractor())
+    return ProbabilisticActor(
+        TensorDictModule(net, in_keys=[observation], out_keys=["loc", "scale"]),
+        in_keys=["loc", "scale"],
+        out_keys=[action],
+        spec=Bounded(-1, 1, (ACT,)) if action == "action" else None,
+        distribution_class=TanhNormal,
+        return_log_prob=True,
+    )
+
+
+def make_critic(observation="observation", action="action", **kwargs) -> ValueOperator:
+    return ValueOperator(MLP(OBS + ACT, 1, num_cells=[8]), in_keys=[observation, action], **kwargs)
+
+
+def make_data(*batch: int) -> TensorDict:
+    done = torch.rand(*batch, 1) < 0.3
+    return TensorDict(
+        {
+            "observation": torch.randn(*batch, OBS),
+            "action": torch.rand(*batch, ACT) * 1.8 - 0.9,
+            "action_log_prob": torch.randn(batch) - 1,
+            "next": {
+                "observation": torch.randn(*batch, OBS),
+                "reward": torch.randn(*batch, 1),
+                "done": done,
+                "terminated": done & (torch.rand(*batch, 1) < 0.5),
+            },
+        },
+        batch,
+    )
+
+
+def make_precomputed(*batch: int) -> TensorDict:
+    """Data with every input in it: no network is needed."""
+    data = make_data(*batch)
+    data["policy_log_prob"] = torch.randn(batch)
+    data["state_action_value"] = torch.randn(*batch, 1)
+    data["next", "state_value"] = torch.randn(*batch, 1)
+    return data
+
+
+def reference(data: TensorDictBase, lmbda: float = LMBDA, gamma: float = GAMMA, **overrides):
+    """The functional on precomputed entries; time last."""
+    inputs = {
+        "log_pi": data.get("policy_log_prob", None),
+        "log_mu": data["action_log_prob"],
+        "action_value": data.get("state_action_value", None),
+        "next_state_value": data.get(("next", "state_value"), None),
+        **overrides,
+    }
+    for name in ("log_pi", "log_mu"):
+        inputs[name] = inputs[name].reshape(*data.batch_size, 1)
+    flags = {name: data["next", name] for name in ("reward", "done", "terminated")}
+    return retrace_lambda_return_estimate(gamma, lmbda, **inputs, **flags)
+
+
+class Forbidden(nn.Module):
+    def forward(self, *args: Tensor) -> Tensor:
+        raise AssertionError("this network was not to be called")
+
+
+# Alone ------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("batch", [(7,), (4, 7), (2, 3, 7)])
+def test_precomputed(batch: tuple[int, ...]) -> None:
+    data = make_precomputed(*batch)
+    expected = reference(data)
+    estimator = RetraceEstimator(gamma=GAMMA, lmbda=LMBDA)
+    torch.testing.assert_close(estimator.value_estimate(data.copy()), expected)
+    out = estimator(data)
+    assert out is data
+    torch.testing.assert_close(out["value_target"], expected)
+    torch.testing.assert_close(out["advantage"], expected - data["state_action_value"])
+
+
+def test_log_densities_with_a_feature_dimension() -> None:
+    data = make_precomputed(4, 7)
+    expected = reference(data)
+    for key in ("policy_log_prob", "action_log_prob"):
+        data[key] = data[key].unsqueeze(-1)
+    estimator = RetraceEstimator(gamma=GAMMA, lmbda=LMBDA)
+    torch.testing.assert_close(estimator.value_estimate(data), expected)
+
+
+def test_networks_compute_what_is_missing() -> None:
+    actor, critic, data = make_actor(), make_critic(), make_data(4, 7)
+    estimator = RetraceEstimator(
+        gamma=GAMMA, lmbda=LMBDA, actor_network=actor, value_network=critic
+    )
+    keys = set(data.keys(True, True))
+    torch.manual_seed(1)
+    out = estimator(data.copy())
+    assert set(out.keys(True, True)) == keys | {"advantage", "value_target"}
+
+    # The log-density of the stored action, by the change of variables.
+    with torch.no_grad():
+        loc, scale = actor.module[0].module(data["observation"])
+        normal = torch.distributions.Normal(loc, scale)
+        raw = data["action"].atanh()
+        log_pi = (normal.log_prob(raw) - (1 - data["action"].square()).log()).sum(-1)
+        value = critic.module(data["observation"], data["action"])
+        torch.manual_seed(1)
+        next_action = actor.get_dist(data["next"]).sample()
+        next_value = critic.module(data["next", "observation"], next_action)
+    expected = reference(data, log_pi=log_pi, action_value=value, next_state_value=next_value)
+    torch.testing.assert_close(out["value_target"], expected, rtol=1e-4, atol=1e-4)
+    torch.testing.assert_close(out["advantage"], expected - value, rtol=1e-4, atol=1e-4)
+    assert not out["value_target"].requires_grad
+
+
+@pytest.mark.parametrize("reads", [None, True])
+def test_existing_entries_win(reads: bool | None) -> None:
+    data = make_precomputed(4, 7)
+    actor, critic = make_actor(), make_critic()
+    actor.module[0].module, critic.module = Forbidden(), Forbidden()
+    estimator = RetraceEstimator(
+        gamma=GAMMA, lmbda=LMBDA, actor_network=actor, value_network=critic, skip_existing=reads
+    )
+    torch.testing.assert_close(estimator.value_estimate(data), reference(data))
+
+
+def test_skip_existing_false_recomputes() -> None:
+    data = make_precomputed(4, 7)
+    settings = {
+        "gamma": GAMMA,
+        "lmbda": LMBDA,
+        "actor_network": make_actor(),
+        "value_network": make_critic(),
+    }
+    fresh = data.exclude("policy_log_prob", "state_action_value")
+    expected = RetraceEstimator(**settings).value_estimate(fresh)
+    estimator = RetraceEstimator(**settings, skip_existing=False)
+    torch.testing.assert_close(estimator.value_estimate(data), expected)
+    assert not torch.allclose(expected, reference(data))
+
+
+def test_params_and_target_params() -> None:
+    data = make_precomputed(4, 7).exclude("state_action_value")
+    critics = [make_critic() for _ in range(3)]
+    values = [critic(data.copy())["state_action_value"].detach() for critic in critics]
+    params = [TensorDict.from_module(critic).detach() for critic in critics]
+    estimator = RetraceEstimator(gamma=GAMMA, lmbda=LMBDA, value_network=make_critic())
+
+    target = reference(data, action_value=values[0])
+    torch.testing.assert_close(estimator.value_estimate(data, target_params=params[0]), target)
+    out = estimator(data.copy(), params=params[0])
+    torch.testing.assert_close(out["value_target"], target)
+    torch.testing.assert_close(out["advantage"], target - values[0])
+    out = estimator(data.copy(), params=params[1], target_params=params[0])
+    torch.testing.assert_close(out["value_target"], target)
+    torch.testing.assert_close(out["advantage"], target - values[1])
+
+    # Parameters with a batch dimension are an ensemble: the smallest value counts.
+    smallest = torch.stack(values).min(0).values
+    for deactivate_vmap in (False, True):
+        estimator.deactivate_vmap = deactivate_vmap
+        out = estimator.value_estimate(data, target_params=torch.stack(params))
+        torch.testing.assert_close(out, reference(data, action_value=smallest))
+
+
+@pytest.mark.parametrize(
+    "chunks", [{"value_chunk_size": 2}, {"num_chunks": 3}, {"num_chunks": 3, "value_chunk_dim": 1}]
+)
+def test_chunks(chunks: dict[str, int]) -> None:
+    data = make_precomputed(5, 7).exclude("state_action_value")
+    critic = make_critic()
+    sizes = []
+    critic.register_forward_pre_hook(lambda module, args: sizes.append(args[0].batch_size))
+    settings = {"gamma": GAMMA, "lmbda": LMBDA, "value_network": critic}
+    expected = RetraceEstimator(**settings).value_estimate(data)
+    assert sizes.pop() == (5, 7)
+    torch.testing.assert_close(
+        RetraceEstimator(**settings, **chunks).value_estimate(data), expected
+    )
+    dim = chunks.get("value_chunk_dim", 0)
+    assert len(sizes) == 3
+    assert sum(size[dim] for size in sizes) == data.shape[dim]
+
+
+def test_value_arguments() -> None:
+    data = make_precomputed(4, 7)
+    next_value = torch.randn(4, 7, 1)
+    target = RetraceEstimator(gamma=GAMMA, lmbda=LMBDA).value_estimate(data, next_value=next_value)
+    torch.testing.assert_close(target, reference(data, next_state_value=next_value))
+    value = torch.randn(4, 7, 1)
+    target = RetraceEstimator(gamma=GAMMA, lmbda=LMBDA).value_estimate(data, action_value=value)
+    torch.testing.assert_close(target, reference(data, action_value=value))
+
+
+def test_missing_terminated_is_done() -> None:
+    data = make_precomputed(4, 7)
+    del data["next", "terminated"]
+    target = RetraceEstimator(gamma=GAMMA, lmbda=LMBDA).value_estimate(data)
+    data["next", "terminated"] = data["next", "done"]
+    torch.testing.assert_close(target, reference(data))
+
+
+@pytest.mark.parametrize("how", ["constructor", "call", "name"])
+def test_time_dim(how: str) -> None:
+    data = make_precomputed(4, 7)
+    expected = reference(data)
+    moved = data.transpose(0, 1).contiguous()
+    estimator = RetraceEstimator(
+        gamma=GAMMA, lmbda=LMBDA, time_dim=0 if how == "constructor" else None
+    )
+    if how == "name":
+        moved.names = ["time", None]
+    target = estimator.value_estimate(moved, time_dim=-2 if how == "call" else None)
+    torch.testing.assert_close(target, expected.transpose(0, 1))
+
+
+def test_flat_slices() -> None:
+    """A flat sample of slices has the targets of the same slices side by side."""
+    num_slices, steps = 4, 5
+    buffer = TensorDictReplayBuffer(
+        storage=LazyTensorStorage(40),
+        sampler=SliceSampler(slice_len=steps, traj_key="episode", strict_length=True),
+        batch_size=num_slices * steps,
+    )
+    stored = make_precomputed(40)
+    stored["episode"] = torch.arange(40) // 10
+    stored["next", "done"] = stored["next", "terminated"] = torch.zeros(40, 1, dtype=torch.bool)
+    buffer.extend(stored)
+    flat = buffer.sample()
+    assert flat.shape == (num_slices * steps,)
+    estimator = RetraceEstimator(gamma=GAMMA, lmbda=LMBDA)
+    target = estimator.value_estimate(flat)
+    apart = flat.reshape(num_slices, steps)
+    apart["next", "done"] = torch.zeros_like(apart["next", "done"])
+    torch.testing.assert_close(target, reference(apart).flatten(0, 1))
+
+
+def test_keys() -> None:
+    data = make_precomputed(4, 7)
+    renamed = TensorDict(
+        {
+            "critic": {"q": data["state_action_value"]},
+            "agent": {"log_mu": data["action_log_prob"], "log_pi": data["policy_log_prob"]},
+            "next": {
+                "v": data["next", "state_value"],
+                "cost": data["next", "reward"],
+                "flags": data["next"].select("done", "terminated"),
+            },
+        },
+        data.batch_size,
+    )
+    estimator = RetraceEstimator(gamma=GAMMA, lmbda=LMBDA)
+    estimator.set_keys(
+        advantage=("out", "advantage"),
+        value_target=("out", "target"),
+        value="v",
+        state_action_value=("critic", "q"),
+        reward="cost",
+        done=("flags", "done"),
+        terminated=("flags", "terminated"),
+        sample_log_prob=("agent", "log_mu"),
+        policy_log_prob=("agent", "log_pi"),
+    )
+    out = estimator(renamed)
+    torch.testing.assert_close(out["out", "target"], reference(data))
+    assert estimator.out_keys == [("out", "advantage"), ("out", "target")]
+    assert ("out", "advantage") in out.keys(True)
+
+
+def test_nested_keys_of_networks() -> None:
+    observation, action = ("agent", "obs"), ("agent", "act")
+    actor = make_actor(observation, action)
+    critic = make_critic(observation, action, out_keys=[("agent", "q")])
+    estimator = RetraceEstimator(
+        gamma=GAMMA, lmbda=LMBDA, actor_network=actor, value_network=critic
+    )
+    estimator.set_keys(state_action_value=("agent", "q"))
+    assert estimator.tensor_keys.action == action
+    assert estimator.tensor_keys.sample_log_prob == ("agent", "act_log_prob")
+    data = make_data(4, 7)
+    nested = TensorDict({"next": data["next"].exclude("observation")}, data.batch_size)
+    nested["next", "agent", "obs"] = data["next", "observation"]
+    nested["agent", "obs"], nested["agent", "act"] = data["observation"], data["action"]
+    nested["agent", "act_log_prob"] = data["action_log_prob"]
+
+    plain = RetraceEstimator(
+        gamma=GAMMA, lmbda=LMBDA, actor_network=make_actor(), value_network=make_critic()
+    )
+    plain.actor_network.load_state_dict(actor.state_dict())
+    plain.value_network.load_state_dict(critic.state_dict())
+    targets = []
+    for each, inputs in ((plain, data), (estimator, nested)):
+        torch.manual_seed(1)
+        targets.append(each.value_estimate(inputs))
+    torch.testing.assert_close(*targets)
+
+
+def test_set_keys_rejects() -> None:
+    estimator = RetraceEstimator(gamma=GAMMA, lmbda=LMBDA)
+    before = estimator.tensor_keys
+    with pytest.raises(KeyError, match="cost is not an accepted tensordict key"):
+        estimator.set_keys(reward="r", cost="c")
+    for key in (None, 3):
+        with pytest.raises(ValueError, match="must be a string or a tuple"):
+            estimator.set_keys(reward=key)
+    assert estimator.tensor_keys == before
+
+
+def test_dispatch() -> None:
+    data = make_data(4, 7)
+    estimator = RetraceEstimator(
+        gamma=GAMMA, lmbda=LMBDA, actor_network=make_actor(), value_network=make_critic()
+    )
+    torch.manual_seed(1)
+    expected = estimator(data.copy())
+    torch.manual_seed(1)
+    advantage, target = estimator(
+        observation=data["observation"],
+        action=data["action"],
+        action_log_prob=data["action_log_prob"],
+        **{f"next_{key}": value for key, value in data["next"].items()},
+    )
+    torch.testing.assert_close(target, expected["value_target"])
+    torch.testing.assert_close(advantage, expected["advantage"])
+
+
+def test_one_call_of_the_critic_per_state() -> None:
+    data, critic, calls = make_precomputed(4, 7), make_critic(), []
+    critic.register_forward_hook(lambda *args: calls.append(args))
+    RetraceEstimator(gamma=GAMMA, lmbda=LMBDA, value_network=critic)(
+        data.exclude("state_action_value")
+    )
+    assert len(calls) == 1
+
+
+def test_in_keys_suffice() -> None:
+    data = make_precomputed(4, 7)
+    networks = {"actor_network": make_actor(), "value_network": make_critic()}
+    for chosen in ({}, {"actor_network": networks["actor_network"]}, networks):
+        estimator = RetraceEstimator(gamma=GAMMA, lmbda=LMBDA, **chosen)
+        estimator(data.select(*estimator.in_keys))
+        needed = data.select(*estimator.in_keys)
+        assert set(estimator.in_keys) == set(needed.keys(True, True))
+
+
+@pytest.mark.parametrize("differentiable", [True, False])
+def test_differentiable(differentiable: bool) -> None:
+    data = make_precomputed(4, 7)
+    reward = data["next", "reward"].requires_grad_()
+    estimator = RetraceEstimator(gamma=GAMMA, lmbda=LMBDA, differentiable=differentiable)
+    out = estimator(data)
+    assert out["value_target"].requires_grad is differentiable
+    assert out["advantage"].requires_grad is differentiable
+    if differentiable:
+        (gradient,) = torch.autograd.grad(out["value_target"].sum(), reward)
+        (expected,) = torch.autograd.grad(reference(data).sum(), reward)
+        torch.testing.assert_close(gradient, expected)
+
+
+def test_networks_get_no_gradient() -> None:
+    data, actor, critic = make_data(4, 7), make_actor(), make_critic()
+    data["next", "reward"].requires_grad_()
+    estimator = RetraceEstimator(
+        gamma=GAMMA, lmbda=LMBDA, actor_network=actor, value_network=critic, differentiable=True
+    )
+    estimator(data)["advantage"].sum().backward()
+    assert all(p.grad is None for net in (actor, critic) for p in net.parameters())
+
+
+def test_average_rewards() -> None:
+    data = make_precomputed(4, 7)
+    target = RetraceEstimator(gamma=GAMMA, lmbda=LMBDA, average_rewards=True).value_estimate(data)
+    reward = data["next", "reward"]
+    data["next", "reward"] = (reward - reward.mean()) / reward.std()
+    torch.testing.assert_close(target, reference(data))
+
+
+def test_settings_are_not_state() -> None:
+    actor, critic = make_actor(), make_critic()
+    estimator = RetraceEstimator(
+        gamma=torch.tensor([0.5]), lmbda=1, actor_network=actor, value_network=critic
+    )
+    assert not estimator.state_dict()
+    assert not list(estimator.parameters())
+    assert estimator.gamma.shape == estimator.lmbda.shape == ()
+    assert estimator.to(torch.float64).gamma.item() == 0.5
+
+
+@pytest.mark.parametrize("name", ["gamma", "lmbda"])
+@pytest.mark.parametrize("value", [-0.1, 1.01, float("nan"), torch.tensor(2.0), torch.ones(2)])
+def test_bad_coefficients(name: str, value: float | Tensor) -> None:
+    with pytest.raises(ValueError, match=rf"{name} must be one number in \[0, 1\]"):
+        RetraceEstimator(**{"gamma": GAMMA, "lmbda": LMBDA, name: value})
+
+
+@pytest.mark.parametrize("name", ["advantage_key", "value_target_key", "value_key"])
+def test_deprecated_keys(name: str) -> None:
+    with pytest.raises(RuntimeError, match=f"'{name}' via constructor is deprecated"):
+        RetraceEstimator(gamma=GAMMA, lmbda=LMBDA, **{name: "key"})
+
+
+@pytest.mark.parametrize(
+    "key",
+    [
+        "policy_log_prob",
+        "state_action_value",
+        "action_log_prob",
+        ("next", "state_value"),
+        ("next", "reward"),
+        ("next", "done"),
+    ],
+)
+def test_missing_entries(key: str | tuple[str, str]) -> None:
+    data = make_precomputed(4, 7).exclude(key)
+    estimator = RetraceEstimator(gamma=GAMMA, lmbda=LMBDA)
+    with pytest.raises(KeyError) as error:
+        estimator(data)
+    assert repr(key) in str(error.value)
+    assert "value_target" not in data
+
+
+@pytest.mark.parametrize("key", ["observation", "action", ("next", "observation")])
+def test_missing_inputs_of_networks(key: str | tuple[str, str]) -> None:
+    data = make_data(4, 7).exclude(key)
+    estimator = RetraceEstimator(
+        gamma=GAMMA, lmbda=LMBDA, actor_network=make_actor(), value_network=make_critic()
+    )
+    with pytest.raises(KeyError, match=key if isinstance(key, str) else key[-1]):
+        estimator(data)
+
+
+def test_critic_that_writes_another_key() -> None:
+    critic = make_critic(out_keys=["q"])
+    estimator = RetraceEstimator(gamma=GAMMA, lmbda=LMBDA, value_network=critic)
+    data = make_precomputed(4, 7).exclude("state_action_value")
+    with pytest.raises(KeyError, match="state_action_value"):
+        estimator(data)
+
+
+def test_bad_data() -> None:
+    estimator = RetraceEstimator(gamma=GAMMA, lmbda=LMBDA)
+    with pytest.raises(RuntimeError, match="no dimension of time"):
+        estimator(make_precomputed(1)[0])
+    data = make_precomputed(4, 7)
+    data["steps_to_next_obs"] = torch.full((4, 7, 1), 3)
+    with pytest.raises(ValueError, match="multi-step"):
+        estimator(data)
+    data = make_precomputed(4, 7)
+    data["policy_log_prob"] = torch.randn(4, 7, ACT)
+    with pytest.raises(ValueError, match="log_pi must have shape"):
+        estimator(data)
+
+
+def test_compile() -> None:
+    data = make_precomputed(4, 7)
+    estimator = RetraceEstimator(gamma=GAMMA, lmbda=LMBDA)
+    compiled = torch.compile(estimator.value_estimate, backend="eager", fullgraph=True)
+    torch.testing.assert_close(compiled(data), reference(data))
+
+
+# In a loss --------------------------------------------------------------------------------------
+
+
+def make_sac(**kwargs) -> SACLoss:
+    loss = SACLoss(make_actor(), make_critic(), **kwargs)
+    SoftUpdate(loss, eps=0.5)
+    return loss
+
+
+def make_td3(**kwargs) -> TD3Loss:
+    loss = TD3Loss(make_actor(), make_critic(), bounds=(-1, 1), delay_actor=True, **kwargs)
+    SoftUpdate(loss, eps=0.5)
+    return loss
+
+
+def make_ddpg() -> DDPGLoss:
+    loss = DDPGLoss(make_actor(), make_critic(), delay_actor=True)
+    SoftUpdate(loss, eps=0.5)
+    return loss
+
+
+def make_sac_v1() -> SACLoss:
+    value = ValueOperator(MLP(OBS, 1, num_cells=[8]), in_keys=["observation"])
+    loss = SACLoss(make_actor(), make_critic(), value)
+    SoftUpdate(loss, eps=0.5)
+    return loss
+
+
+def with_retrace(loss: LossModule, **kwargs) -> LossModule:
+    settings = {"gamma": GAMMA, "lmbda": LMBDA, **kwargs}
+    return loss.make_value_estimator(RetraceEstimator.for_loss(loss, **settings))
+
+
+LOSSES = [make_sac, make_td3, make_ddpg, make_sac_v1]
+
+
+@pytest.mark.parametrize("make_loss", LOSSES)
+def test_lambda_zero_is_the_loss_with_td0(make_loss: Callable[[], LossModule]) -> None:
+    loss, data = make_loss(), make_data(4, 6)
+    outputs = []
+    for prepare in (
+        lambda: loss.make_value_estimator(gamma=GAMMA),
+        lambda: with_retrace(loss, lmbda=0.0),
+        lambda: with_retrace(loss, lmbda=0.9),
+    ):
+        prepare()
+        torch.manual_seed(1)
+        outputs.append(loss(data.copy()))
+    td0, retrace0, retrace = outputs
+    torch.testing.assert_close(td0, retrace0)
+    name = "loss_value" if make_loss is make_ddpg else "loss_qvalue"
+    assert abs(retrace[name] - td0[name]) > 1e-4
+
+
+@pytest.mark.parametrize("make_loss", LOSSES)
+def test_parameters_and_state_of_the_loss(make_loss: Callable[[], LossModule]) -> None:
+    loss = make_loss()
+    parameters, state, modules = dict(loss.named_parameters()), loss.state_dict(), {*loss.modules()}
+    with_retrace(loss)
+    loss(make_data(4, 6))
+    assert loss.state_dict().keys() == state.keys()
+    after = dict(loss.named_parameters())
+    assert after.keys() == parameters.keys()
+    assert all(after[name] is parameters[name] for name in parameters)
+    assert {*loss.modules()} - modules == {loss.value_estimator}
+    loss.load_state_dict(state)
+
+
+def sac_target(loss: SACLoss, data: TensorDictBase, next_value: Tensor) -> Tensor:
+    """The target from networks rebuilt with the loss's present parameters."""
+    actor, critics = make_actor(), [make_critic() for _ in range(loss.num_qvalue_nets)]
+    loss.actor_network_params.data.to_module(actor)
+    values = []
+    for critic, params in zip(critics, loss.target_qvalue_network_params.unbind(0), strict=True):
+        params.data.to_module(critic)
+        values.append(critic(data.copy())["state_action_value"])
+    log_pi = actor.get_dist(data.copy()).log_prob(data["action"])
+    return reference(
+        data,
+        log_pi=log_pi.detach(),
+        action_value=torch.stack(values).min(0).values.detach(),
+        next_state_value=next_value,
+    )
+
+
+def test_sac_training_stays_in_sync() -> None:
+    loss = with_retrace(SACLoss(make_actor(), make_critic(), num_qvalue_nets=3))
+    updater = SoftUpdate(loss, eps=0.5)
+    optimizer = torch.optim.Adam(loss.parameters(), lr=0.05)
+    data = make_data(4, 6)
+    next_value = torch.randn(4, 6, 1)
+    targets = []
+    for _ in range(3):
+        probe = data.copy().set(("next", "state_value"), next_value)
+        target = loss.value_estimator.value_estimate(probe)
+        torch.testing.assert_close(target, sac_target(loss, data, next_value))
+        targets.append(target)
+        out = loss(data.copy())
+        sum(value for name, value in out.items() if name.startswith("loss_")).backward()
+        optimizer.step()
+        optimizer.zero_grad()
+        updater.step()
+    assert not torch.allclose(targets[0], targets[1])
+    assert not torch.allclose(targets[1], targets[2])
+
+
+def test_sac_target_is_soft() -> None:
+    # One step to a truncation: the target is r + gamma (min Q - alpha log pi) of the next state.
+    loss = with_retrace(make_sac(alpha_init=0.7))
+    data = make_data(5, 1)
+    data["next", "terminated"][:] = False
+    next_actor = make_actor()
+    loss.actor_network_params.data.to_module(next_actor)
+    torch.manual_seed(1)
+    target = loss._compute_target_v2(data)
+    torch.manual_seed(1)
+    dist = next_actor.get_dist(data["next"].copy())
+    action = dist.rsample()
+    following = TensorDict({**data["next"], "action": action}, data.batch_size)
+    values = []
+    for params in loss.target_qvalue_network_params.unbind(0):
+        critic = make_critic()
+        params.data.to_module(critic)
+        values.append(critic(following.copy())["state_action_value"])
+    soft = torch.stack(values).min(0).values.squeeze(-1) - 0.7 * dist.log_prob(action)
+    expected = data["next", "reward"].squeeze(-1) + GAMMA * soft
+    torch.testing.assert_close(target, expected.detach(), rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.parametrize("make_loss", [make_sac, make_td3])
+def test_deactivate_vmap(make_loss: Callable[..., LossModule]) -> None:
+    data, targets = make_precomputed(4, 6).exclude("state_action_value"), []
+    for deactivate_vmap in (False, True):
+        torch.manual_seed(0)
+        loss = with_retrace(make_loss(deactivate_vmap=deactivate_vmap))
+        assert loss.value_estimator.deactivate_vmap is deactivate_vmap
+        loss.value_estimator.set_keys(value="state_value")
+        targets.append(loss.value_estimator.value_estimate(data))
+    torch.testing.assert_close(*targets)
+
+
+def test_flat_batch_in_a_loss() -> None:
+    loss = with_retrace(make_sac())
+    data = make_data(4, 6)
+    data["next", "done"][:, -1] = True
+    data["next", "state_value"] = torch.randn(4, 6, 1)
+    target = loss.value_estimator.value_estimate(data)
+    flat = loss.value_estimator.value_estimate(data.flatten(0, 1))
+    torch.testing.assert_close(flat, target.flatten(0, 1))
+
+
+def test_advantage_in_a_loss() -> None:
+    loss = with_retrace(make_sac())
+    data = make_precomputed(4, 6).exclude("policy_log_prob", "state_action_value")
+    target = sac_target(loss, data, data["next", "state_value"])
+    params = loss.qvalue_network_params[0].data
+    out = loss.value_estimator(data.copy(), params=params)
+    torch.testing.assert_close(out["value_target"], target)
+    critic = make_critic()
+    params.to_module(critic)
+    value = critic(data.copy())["state_action_value"]
+    torch.testing.assert_close(out["advantage"], (target - value).detach())
+
+
+def test_copy_of_a_loss_is_on_its_own() -> None:
+    loss = with_retrace(make_sac())
+    data = make_precomputed(4, 6).exclude("policy_log_prob", "state_action_value")
+    before = loss.value_estimator.value_estimate(data)
+    twin = copy.deepcopy(loss)
+    for parameter in twin.parameters():
+        parameter.data.add_(0.3)
+    torch.testing.assert_close(loss.value_estimator.value_estimate(data), before)
+    assert not torch.allclose(twin.value_estimator.value_estimate(data), before)
+
+
+def test_loss_forwards_its_keys() -> None:
+    loss = with_retrace(make_sac())
+    loss.set_keys(reward="cost", done="end", terminated="stop", value="v")
+    keys = loss.value_estimator.tensor_keys
+    assert (keys.reward, keys.done, keys.terminated, keys.value) == ("cost", "end", "stop", "v")
+    data = make_data(4, 6)
+    for old, new in (("reward", "cost"), ("done", "end"), ("terminated", "stop")):
+        data["next"].rename_key_(old, new)
+    assert loss(data)["loss_qvalue"].isfinite()
+
+
+def test_registry() -> None:
+    class RetraceSAC(SACLoss):
+        SUPPORTED_VALUE_ESTIMATORS = (*SACLoss.SUPPORTED_VALUE_ESTIMATORS, "retrace")
+
+    loss = RetraceSAC(make_actor(), make_critic())
+    loss.set_keys(reward="cost")
+    loss.make_value_estimator("retrace", lmbda=0.5)
+    estimator = loss.value_estimator
+    assert isinstance(estimator, RetraceEstimator)
+    assert estimator.lmbda.item() == 0.5
+    assert estimator.gamma.item() == pytest.approx(0.99)
+    assert estimator.tensor_keys.reward == "cost"
+    data = make_precomputed(4, 6).exclude("policy_log_prob", "state_action_value")
+    data["next"].rename_key_("reward", "cost")
+    SoftUpdate(loss, eps=0.5)
+    assert estimator.value_estimate(data).isfinite().all()
+
+
+def test_class_without_the_loss_says_what_to_do() -> None:
+    # TorchRL builds a class without telling it which loss it is for.
+    loss = make_sac()
+    loss.make_value_estimator(RetraceEstimator, gamma=GAMMA, lmbda=LMBDA)
+    with pytest.raises(KeyError, match=r"RetraceEstimator\.for_loss"):
+        loss(make_data(4, 6))
+
+
+def test_next_value_must_come_from_the_loss() -> None:
+    # A plain next value in its place would silently lose the entropy bonus.
+    loss = with_retrace(make_sac())
+    with pytest.raises(KeyError, match="one tied to a loss expects it from the loss"):
+        loss.value_estimator(make_data(4, 6))
+
+
+def test_deterministic_actor() -> None:
+    actor = TensorDictModule(
+        MLP(OBS, ACT, num_cells=[8]), in_keys=["observation"], out_keys=["action"]
+    )
+    loss = TD3Loss(actor, make_critic(), bounds=(-1, 1), delay_actor=True)
+    SoftUpdate(loss, eps=0.5)
+    with_retrace(loss)
+    data = make_data(4, 6)
+    with pytest.raises(KeyError, match=r"'policy_log_prob'.*got TensorDictModule"):
+        loss(data.copy())
+    data["policy_log_prob"] = torch.randn(4, 6)
+    assert loss(data)["loss_qvalue"].isfinite()
+
+
+def test_losses_without_a_critic_of_actions() -> None:
+    critic = TensorDictModule(nn.Linear(OBS, ACT), ["observation"], ["action_value"])
+    with pytest.raises(ValueError, match="DQNLoss lacks one of them"):
+        RetraceEstimator.for_loss(DQNLoss(critic, action_space="one-hot"), gamma=0.9, lmbda=0.9)
+
+
+def test_estimator_can_be_replaced() -> None:
+    loss = with_retrace(make_sac())
+    loss.make_value_estimator(TD0Estimator, gamma=GAMMA, value_network=None)
+    assert loss(make_data(4, 6))["loss_qvalue"].isfinite()
+
+
+# Both come from tensordict and TorchRL under torch.compile, with any estimator.
+@pytest.mark.filterwarnings("ignore:.*autograd.function.Function.*instantiated:DeprecationWarning")
+@pytest.mark.filterwarnings("ignore:torch._dynamo.config.inline_inbuilt_nn_modules:FutureWarning")
+def test_compile_in_a_loss() -> None:
+    loss = with_retrace(make_sac())
+    data = make_precomputed(4, 6).exclude("policy_log_prob", "state_action_value")
+    estimate = loss.value_estimator.value_estimate
+    expected = estimate(data)
+    compiled = torch.compile(estimate, backend="eager", fullgraph=True)
+    torch.testing.assert_close(compiled(data), expected)

@@ -1,0 +1,489 @@
+"""Retrace targets against their definition, TD(lambda), expected SARSA and a solved MDP."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from torch import Tensor
+from torchrl.objectives.value.functional import (
+    td_lambda_return_estimate,
+    vec_td_lambda_return_estimate,
+)
+
+from torchrl_safe.objectives.value import retrace_lambda_return_estimate, retrace_variance_reward
+
+GAMMA, LMBDA = 0.95, 0.9
+NAMES = (
+    "log_pi",
+    "log_mu",
+    "action_value",
+    "next_state_value",
+    "reward",
+    "done",
+    "terminated",
+)
+
+
+def make_inputs(
+    *batch: int, steps: int, features: int = 1, dtype: torch.dtype = torch.float64, seed: int = 0
+) -> dict[str, Tensor]:
+    generator = torch.Generator().manual_seed(seed)
+    shape = (*batch, steps, features)
+
+    def randn(*size: int) -> Tensor:
+        return torch.randn(size, generator=generator, dtype=torch.float64).to(dtype)
+
+    done = torch.rand(shape, generator=generator) < 0.3
+    return {
+        "log_pi": randn(*shape[:-1], 1),
+        "log_mu": randn(*shape[:-1], 1),
+        "action_value": randn(*shape),
+        "next_state_value": randn(*shape),
+        "reward": randn(*shape),
+        "done": done,
+        "terminated": done & (torch.rand(shape, generator=generator) < 0.5),
+    }
+
+
+def by_definition(gamma, lmbda, log_pi, log_mu, q, next_value, reward, done, terminated) -> Tensor:
+    """Q + sum over s >= t of gamma^(s-t) (prod of lmbda rho up to s) (TD error of s), in floats."""
+    target = torch.empty_like(reward)
+    *batch, steps, features = reward.shape
+    gamma = torch.as_tensor(gamma, dtype=torch.float64).expand(reward.shape)
+    for index in torch.cartesian_prod(*map(torch.arange, (*batch, features))).reshape(
+        -1, len(batch) + 1
+    ):
+        *b, f = index.tolist()
+        at = [(*b, t, f) for t in range(steps)]
+        ratio = [math.exp((log_pi - log_mu)[(*b, t, 0)].item()) for t in range(steps)]
+        for t in range(steps):
+            total = q[at[t]].item()
+            for s in range(t, steps):
+                weight = 1.0
+                for i in range(t + 1, s + 1):
+                    weight *= gamma[at[i - 1]].item() * lmbda * min(1.0, ratio[i])
+                bootstrap = 0.0 if terminated[at[s]] else next_value[at[s]].item()
+                error = reward[at[s]] + gamma[at[s]] * bootstrap - q[at[s]]
+                total += weight * error.item()
+                if done[at[s]]:
+                    break
+            target[at[t]] = total
+    return target
+
+
+@pytest.mark.parametrize("steps", [1, 2, 3, 8, 13, 32])
+@pytest.mark.parametrize(("batch", "features"), [((), 1), ((3,), 1), ((2, 2), 3)])
+def test_definition(batch: tuple[int, ...], steps: int, features: int) -> None:
+    inputs = make_inputs(*batch, steps=steps, features=features, seed=steps)
+    target = retrace_lambda_return_estimate(GAMMA, LMBDA, **inputs)
+    torch.testing.assert_close(target, by_definition(GAMMA, LMBDA, *inputs.values()))
+
+
+def test_discount_per_step() -> None:
+    inputs = make_inputs(2, steps=9, features=2)
+    gamma = torch.rand(2, 9, 1, dtype=torch.float64)
+    expected = by_definition(gamma, LMBDA, *inputs.values())
+    torch.testing.assert_close(retrace_lambda_return_estimate(gamma, LMBDA, **inputs), expected)
+    moved = {name: tensor.transpose(0, 1) for name, tensor in inputs.items()}
+    target = retrace_lambda_return_estimate(gamma.transpose(0, 1), LMBDA, **moved, time_dim=0)
+    torch.testing.assert_close(target, expected.transpose(0, 1))
+
+
+@pytest.mark.parametrize("shape", [(), (1,), (1, 1, 1)])
+def test_scalar_tensors(shape: tuple[int, ...]) -> None:
+    inputs = make_inputs(2, steps=5)
+    gamma = torch.full(shape, GAMMA, dtype=torch.float64)
+    lmbda = torch.full(shape, LMBDA, dtype=torch.float64)
+    target = retrace_lambda_return_estimate(gamma, lmbda, **inputs)
+    torch.testing.assert_close(target, retrace_lambda_return_estimate(GAMMA, LMBDA, **inputs))
+
+
+@pytest.mark.parametrize("estimate", [td_lambda_return_estimate, vec_td_lambda_return_estimate])
+def test_on_policy_is_td_lambda(estimate) -> None:
+    # TD(lambda) knows values of states only: the two agree where Q(s, a) = V(s).
+    inputs = make_inputs(4, steps=30)
+    inputs["log_pi"] = inputs["log_mu"]
+    value = inputs["action_value"]
+    follows = ~inputs["done"][:, :-1]
+    inputs["next_state_value"][:, :-1] = torch.where(
+        follows, value[:, 1:], inputs["next_state_value"][:, :-1]
+    )
+    target = retrace_lambda_return_estimate(GAMMA, LMBDA, **inputs)
+    expected = estimate(
+        GAMMA,
+        LMBDA,
+        *(inputs[name] for name in ("next_state_value", "reward", "done", "terminated")),
+    )
+    # TorchRL's vectorised TD(lambda) drops weights below 1e-7.
+    torch.testing.assert_close(target, expected, rtol=1e-5, atol=1e-5)
+
+
+def test_lambda_zero_is_expected_sarsa() -> None:
+    inputs = make_inputs(4, steps=20)
+    target = retrace_lambda_return_estimate(GAMMA, 0.0, **inputs)
+    expected = inputs["reward"] + GAMMA * inputs["next_state_value"] * ~inputs["terminated"]
+    torch.testing.assert_close(target, expected)
+
+
+def test_ratio_is_clipped_and_belongs_to_the_next_step() -> None:
+    zeros = torch.zeros(3, 1, dtype=torch.float64)
+    reward = torch.tensor([[1.0], [10.0], [100.0]], dtype=torch.float64)
+    never = torch.zeros(3, 1, dtype=torch.bool)
+
+    def target(*ratios: float) -> list[float]:
+        log_pi = torch.tensor(ratios, dtype=torch.float64).log().unsqueeze(-1)
+        return (
+            retrace_lambda_return_estimate(0.5, 1.0, log_pi, zeros, zeros, zeros, reward, never)
+            .squeeze(-1)
+            .tolist()
+        )
+
+    assert target(1, 1, 1) == [31, 60, 100]
+    assert target(7, 5, 3) == [31, 60, 100]
+    # The first step's own ratio plays no role; a TD error has none.
+    assert target(0, 1, 1) == [31, 60, 100]
+    assert target(1, 0, 1) == [1, 60, 100]
+    assert target(1, 0.5, 0.25) == [1 + 0.25 * 22.5, 10 + 0.125 * 100, 100]
+
+
+def test_terminated_defaults_to_done() -> None:
+    inputs = make_inputs(3, steps=10)
+    inputs["terminated"] = inputs["done"]
+    expected = retrace_lambda_return_estimate(GAMMA, LMBDA, **inputs)
+    del inputs["terminated"]
+    torch.testing.assert_close(retrace_lambda_return_estimate(GAMMA, LMBDA, **inputs), expected)
+
+
+def test_truncation_inside_the_batch() -> None:
+    """TorchRL issue 4209: a truncated step must not read the trajectory stored after it."""
+    inputs = make_inputs(steps=12)
+    inputs["done"][:] = False
+    inputs["done"][4] = True
+    inputs["terminated"][:] = False
+    whole = retrace_lambda_return_estimate(GAMMA, LMBDA, **inputs)
+    parts = [
+        retrace_lambda_return_estimate(GAMMA, LMBDA, **{k: v[part] for k, v in inputs.items()})
+        for part in (slice(None, 5), slice(5, None))
+    ]
+    torch.testing.assert_close(whole, torch.cat(parts))
+    torch.testing.assert_close(
+        whole[4], inputs["reward"][4] + GAMMA * inputs["next_state_value"][4]
+    )
+
+
+@pytest.mark.parametrize("time_dim", [0, 1, 2, -2, -3, -4])
+def test_time_dim(time_dim: int) -> None:
+    inputs = make_inputs(2, 3, steps=5, features=4)
+    expected = retrace_lambda_return_estimate(GAMMA, LMBDA, **inputs).movedim(-2, time_dim)
+    moved = {name: tensor.movedim(-2, time_dim) for name, tensor in inputs.items()}
+    target = retrace_lambda_return_estimate(GAMMA, LMBDA, **moved, time_dim=time_dim)
+    torch.testing.assert_close(target, expected)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_shapes_are_strict(name: str) -> None:
+    inputs = make_inputs(2, steps=5, features=3)
+    inputs[name] = inputs[name][:, :-1]
+    with pytest.raises(ValueError, match=r"must have shape \(2, [45], [13]\)"):
+        retrace_lambda_return_estimate(GAMMA, LMBDA, **inputs)
+
+
+def test_log_density_has_one_feature() -> None:
+    inputs = make_inputs(2, steps=5, features=3)
+    for log_pi in (inputs["log_pi"].squeeze(-1), inputs["log_pi"].expand(2, 5, 3)):
+        with pytest.raises(ValueError, match=r"log_pi must have shape \(2, 5, 1\)"):
+            retrace_lambda_return_estimate(GAMMA, LMBDA, **{**inputs, "log_pi": log_pi})
+
+
+@pytest.mark.parametrize("time_dim", [-1, 2, 3, -4])
+def test_time_dim_out_of_range(time_dim: int) -> None:
+    inputs = make_inputs(2, steps=5)
+    with pytest.raises(ValueError, match="time_dim must be"):
+        retrace_lambda_return_estimate(GAMMA, LMBDA, **inputs, time_dim=time_dim)
+
+
+@pytest.mark.parametrize("name", ["done", "terminated"])
+def test_flags_are_boolean(name: str) -> None:
+    inputs = make_inputs(2, steps=5)
+    inputs[name] = inputs[name].float()
+    with pytest.raises(TypeError, match=f"{name} must be boolean"):
+        retrace_lambda_return_estimate(GAMMA, LMBDA, **inputs)
+
+
+@pytest.mark.parametrize("value", [-0.1, 1.1, math.nan, math.inf])
+@pytest.mark.parametrize("name", ["gamma", "lmbda"])
+def test_coefficients_out_of_range(name: str, value: float) -> None:
+    coefficients = {"gamma": GAMMA, "lmbda": LMBDA, name: value}
+    with pytest.raises(ValueError, match=rf"{name} must be in \[0, 1\], got {value}"):
+        retrace_lambda_return_estimate(**coefficients, **make_inputs(2, steps=5))
+
+
+@pytest.mark.parametrize("shape", [(5,), (2, 5), (2, 4, 1), (1, 2, 5, 1)])
+def test_coefficient_shape(shape: tuple[int, ...]) -> None:
+    with pytest.raises(ValueError, match="gamma must be a number"):
+        retrace_lambda_return_estimate(torch.ones(shape), LMBDA, **make_inputs(2, steps=5))
+
+
+def test_gradient() -> None:
+    inputs = make_inputs(2, steps=6, features=2)
+    flags = (inputs.pop("done"), inputs.pop("terminated"))
+    coefficients = [torch.tensor(value, dtype=torch.float64) for value in (GAMMA, LMBDA)]
+    arguments = [tensor.requires_grad_() for tensor in (*coefficients, *inputs.values())]
+    assert torch.autograd.gradcheck(
+        lambda *args: retrace_lambda_return_estimate(*args, *flags), arguments
+    )
+
+
+def test_masked_entries_may_be_nan() -> None:
+    inputs = make_inputs(3, steps=12)
+    inputs["done"][0, 4] = inputs["terminated"][0, 4] = True
+    expected = retrace_lambda_return_estimate(GAMMA, LMBDA, **inputs)
+    first = torch.ones_like(inputs["done"])
+    first[:, 1:] = inputs["done"][:, :-1]
+    inputs["next_state_value"][inputs["terminated"]] = math.nan
+    inputs["log_pi"][first] = math.nan
+    inputs["log_mu"][first] = math.nan
+    floating = [inputs[name].requires_grad_() for name in NAMES[:5]]
+    target = retrace_lambda_return_estimate(GAMMA, LMBDA, **inputs)
+    torch.testing.assert_close(target, expected)
+    for gradient in torch.autograd.grad(target.sum(), floating):
+        assert gradient.isfinite().all()
+
+
+def test_impossible_actions() -> None:
+    # A density of zero under either policy: no trace, or a full one.
+    inputs = make_inputs(3, steps=7)
+    inputs["log_pi"][:, 3] = -math.inf
+    inputs["log_mu"][:, 5] = -math.inf
+    finite = {name: tensor.clone() for name, tensor in inputs.items()}
+    finite["log_pi"][:, 3] = -1e3
+    finite["log_mu"][:, 5] = -1e3
+    target = retrace_lambda_return_estimate(GAMMA, LMBDA, **inputs)
+    torch.testing.assert_close(target, by_definition(GAMMA, LMBDA, *clip(finite).values()))
+
+
+def clip(inputs: dict[str, Tensor]) -> dict[str, Tensor]:
+    """Bound the log-ratio, which Python's exp overflows on."""
+    log_mu = torch.maximum(inputs["log_mu"], inputs["log_pi"])
+    return {**inputs, "log_mu": log_mu}
+
+
+@pytest.mark.parametrize(
+    ("dtype", "rtol", "atol"), [(torch.float32, 1e-5, 1e-5), (torch.bfloat16, 0.05, 0.2)]
+)
+def test_dtype(dtype: torch.dtype, rtol: float, atol: float) -> None:
+    inputs = make_inputs(2, steps=200, dtype=dtype)
+    exact = {name: x.double() if x.is_floating_point() else x for name, x in inputs.items()}
+    target = retrace_lambda_return_estimate(GAMMA, LMBDA, **inputs)
+    assert target.dtype == dtype
+    expected = retrace_lambda_return_estimate(GAMMA, LMBDA, **exact)
+    torch.testing.assert_close(target.double(), expected, rtol=rtol, atol=atol)
+
+
+def test_long_undiscounted_trajectory() -> None:
+    # Trace 1 throughout: the sum of what is left, which a product-and-divide scheme handles too;
+    # then ratios of exp(-50), whose products underflow and may not be divided by.
+    steps = 3000
+    ones, zeros = torch.ones(steps, 1), torch.zeros(steps, 1)
+    never = torch.zeros(steps, 1, dtype=torch.bool)
+    target = retrace_lambda_return_estimate(1.0, 1.0, zeros, zeros, zeros, zeros, ones, never)
+    torch.testing.assert_close(target, torch.arange(steps, 0, -1.0).unsqueeze(-1))
+    log_pi = torch.full((steps, 1), -50.0)
+    target = retrace_lambda_return_estimate(1.0, 1.0, log_pi, zeros, zeros, zeros, ones, never)
+    torch.testing.assert_close(target, ones)
+
+
+def test_vmap() -> None:
+    inputs = make_inputs(3, 2, steps=6)
+    expected = retrace_lambda_return_estimate(GAMMA, LMBDA, **inputs)
+    target = torch.vmap(lambda *args: retrace_lambda_return_estimate(GAMMA, LMBDA, *args))(
+        *inputs.values()
+    )
+    torch.testing.assert_close(target, expected)
+    # Over discounts, as in a sweep.
+    gammas = torch.tensor([0.0, 0.5, 1.0], dtype=torch.float64)
+    targets = torch.vmap(lambda gamma: retrace_lambda_return_estimate(gamma, LMBDA, **inputs))(
+        gammas
+    )
+    for gamma, target in zip(gammas.tolist(), targets, strict=True):
+        torch.testing.assert_close(target, retrace_lambda_return_estimate(gamma, LMBDA, **inputs))
+
+
+def test_compile() -> None:
+    compiled = torch.compile(retrace_lambda_return_estimate, backend="eager", fullgraph=True)
+    for steps in (6, 9):
+        inputs = make_inputs(2, steps=steps)
+        torch.testing.assert_close(
+            compiled(GAMMA, LMBDA, **inputs),
+            retrace_lambda_return_estimate(GAMMA, LMBDA, **inputs),
+        )
+
+
+def test_inputs_are_left_alone() -> None:
+    inputs = make_inputs(2, steps=6)
+    before = {name: tensor.clone() for name, tensor in inputs.items()}
+    retrace_lambda_return_estimate(GAMMA, LMBDA, **inputs)
+    for name, tensor in inputs.items():
+        torch.testing.assert_close(tensor, before[name], rtol=0, atol=0)
+
+
+class RandomMDP:
+    """Three states, two actions and a terminal state; all trajectories of three steps.
+
+    Along each, ``a`` is drawn from mu and ``b``, the next action of the bootstrap, from pi.
+    ``mean`` and ``variance`` are those of the discounted cost sum under pi, from linear systems.
+    """
+
+    num_states, num_actions, horizon, gamma = 3, 2, 3, 0.9
+
+    def __init__(self, seed: int) -> None:
+        generator = torch.Generator().manual_seed(seed)
+
+        def rand(*shape: int) -> Tensor:
+            return torch.rand(shape, generator=generator, dtype=torch.float64)
+
+        states, actions, gamma = self.num_states, self.num_actions, self.gamma
+        # The last state is terminal; what follows it is another trajectory's and irrelevant.
+        transition = rand(states + 1, actions, states + 1).square()
+        self.transition = transition / transition.sum(-1, keepdim=True)
+        self.cost = 2 * rand(states + 1, actions, states + 1)
+        self.pi, self.mu = (
+            (weights / weights.sum(-1, keepdim=True))
+            for weights in (rand(states + 1, actions).square(), rand(states + 1, actions))
+        )
+
+        size = states * actions
+        move = self.transition[:-1, :, :-1, None] * self.pi[:-1]
+        move = move.reshape(size, size)
+        chance, cost = self.transition[:-1], self.cost[:-1]
+        eye = torch.eye(size, dtype=torch.float64)
+        mean = torch.linalg.solve(eye - gamma * move, (chance * cost).sum(-1).reshape(size))
+        self.mean = self._with_terminal(mean)
+        next_mean = (self.pi * self.mean).sum(-1)
+        second = chance * (cost.square() + 2 * gamma * cost * next_mean)
+        second = torch.linalg.solve(eye - gamma**2 * move, second.sum(-1).reshape(size))
+        self.variance = self._with_terminal(second - mean.square())
+        self._enumerate()
+
+    def _with_terminal(self, values: Tensor, terminal: float = 0.0) -> Tensor:
+        values = values.reshape(self.num_states, self.num_actions)
+        return torch.cat([values, values.new_full((1, self.num_actions), terminal)])
+
+    def _enumerate(self) -> None:
+        states, actions = self.num_states, self.num_actions
+        sizes = [states, actions, *[states + 1, actions, actions] * self.horizon]
+        first, action, *rest = torch.cartesian_prod(*map(torch.arange, sizes)).unbind(-1)
+        self.start = first * actions + action
+        probability = torch.ones(len(first), dtype=torch.float64)
+        steps, state = [], first
+        for successor, stored, bootstrap in zip(rest[::3], rest[1::3], rest[2::3], strict=True):
+            probability = probability * self.transition[state, action, successor]
+            probability = probability * self.mu[successor, stored] * self.pi[successor, bootstrap]
+            steps.append((state, action, successor, bootstrap))
+            state, action = successor, stored
+        self.probability = probability
+        self.state, self.action, self.successor, self.bootstrap = (
+            torch.stack(column, 1).unsqueeze(-1) for column in zip(*steps, strict=True)
+        )
+
+    def expected_target(self, gamma: float, lmbda: float, value: Tensor, reward: Tensor) -> Tensor:
+        """E_mu[first Retrace target | s, a], for a value ``[S + 1, A]``."""
+        target = retrace_lambda_return_estimate(
+            gamma,
+            lmbda,
+            self.pi.log()[self.state, self.action],
+            self.mu.log()[self.state, self.action],
+            value[self.state, self.action],
+            value[self.successor, self.bootstrap],
+            reward,
+            self.successor == self.num_states,
+        )
+        total = torch.zeros(self.num_states * self.num_actions, dtype=torch.float64)
+        return total.index_add(0, self.start, self.probability * target[:, 0, 0])
+
+    def stored_cost(self) -> Tensor:
+        return self.cost[self.state, self.action, self.successor]
+
+    def variance_reward(self, mean: Tensor) -> Tensor:
+        return retrace_variance_reward(
+            self.gamma,
+            self.stored_cost(),
+            mean[self.state, self.action],
+            mean[self.successor, self.bootstrap],
+            self.successor == self.num_states,
+        )
+
+
+@pytest.fixture(scope="module", params=[0, 1])
+def mdp(request: pytest.FixtureRequest) -> RandomMDP:
+    mdp = RandomMDP(request.param)
+    assert mdp.probability.sum().item() == pytest.approx(mdp.num_states * mdp.num_actions)
+    assert mdp.variance[:-1].min() > 0.01
+    return mdp
+
+
+@pytest.mark.parametrize("lmbda", [0.0, 0.7, 1.0])
+def test_mdp_fixed_point(mdp: RandomMDP, lmbda: float) -> None:
+    """Off-policy, the exact mean and variance of the cost sum are their own expected targets."""
+    garbage = 1e3
+    mean = mdp._with_terminal(mdp.mean[:-1], garbage)
+    variance = mdp._with_terminal(mdp.variance[:-1], garbage)
+    target = mdp.expected_target(mdp.gamma, lmbda, mean, mdp.stored_cost())
+    torch.testing.assert_close(target, mdp.mean[:-1].flatten())
+    target = mdp.expected_target(mdp.gamma**2, lmbda, variance, mdp.variance_reward(mean))
+    torch.testing.assert_close(target, mdp.variance[:-1].flatten())
+
+
+@pytest.mark.parametrize("lmbda", [0.0, 0.97])
+def test_mdp_convergence(mdp: RandomMDP, lmbda: float) -> None:
+    mean, variance = torch.zeros_like(mdp.mean), torch.zeros_like(mdp.mean)
+    for _ in range(60):
+        new_mean = mdp.expected_target(mdp.gamma, lmbda, mean, mdp.stored_cost())
+        variance = mdp._with_terminal(
+            mdp.expected_target(mdp.gamma**2, lmbda, variance, mdp.variance_reward(mean))
+        )
+        mean = mdp._with_terminal(new_mean)
+    torch.testing.assert_close(mean, mdp.mean, rtol=1e-4, atol=1e-4)
+    torch.testing.assert_close(variance, mdp.variance, rtol=1e-3, atol=1e-3)
+
+
+def test_mean_over_next_actions_underestimates_the_variance(mdp: RandomMDP) -> None:
+    state_value = (mdp.pi * mdp.mean).sum(-1, keepdim=True)
+    between_actions = (mdp.pi * (mdp.mean - state_value).square()).sum(-1)
+    reward = retrace_variance_reward(
+        mdp.gamma,
+        mdp.stored_cost(),
+        mdp.mean[mdp.state, mdp.action],
+        state_value.expand_as(mdp.mean)[mdp.successor, mdp.bootstrap],
+        mdp.successor == mdp.num_states,
+    )
+    target = mdp.expected_target(mdp.gamma**2, 0.0, mdp.variance, reward)
+    missing = mdp.gamma**2 * (mdp.transition[:-1] * between_actions).sum(-1)
+    assert missing.min() > 1e-4
+    torch.testing.assert_close(mdp.variance[:-1].flatten() - target, missing.flatten())
+
+
+def test_variance_reward_masks_the_bootstrap() -> None:
+    cost, value = torch.tensor([[3.0], [3.0]]), torch.tensor([[2.0], [2.0]])
+    next_value = torch.tensor([[math.nan], [4.0]])
+    terminated = torch.tensor([[True], [False]])
+    reward = retrace_variance_reward(0.5, cost, value, next_value, terminated)
+    assert reward.squeeze(-1).tolist() == [9 - 4, 25 - 4]
+
+
+@pytest.mark.parametrize("name", ["action_value", "next_action_value", "terminated"])
+def test_variance_reward_checks(name: str) -> None:
+    inputs = {
+        "cost": torch.ones(3, 1),
+        "action_value": torch.ones(3, 1),
+        "next_action_value": torch.ones(3, 1),
+        "terminated": torch.zeros(3, 1, dtype=torch.bool),
+    }
+    with pytest.raises(ValueError, match=rf"{name} must have shape \(3, 1\)"):
+        retrace_variance_reward(0.9, **{**inputs, name: inputs[name][:2]})
+    with pytest.raises(ValueError, match="gamma must be in"):
+        retrace_variance_reward(1.5, **inputs)
+    with pytest.raises(TypeError, match="terminated must be boolean"):
+        retrace_variance_reward(0.9, **{**inputs, "terminated": inputs["cost"]})

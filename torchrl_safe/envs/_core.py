@@ -1,0 +1,350 @@
+"""The simulator behind every face of the goal environments: numpy in, numpy out, N at a time.
+
+This is the only file that touches MuJoCo's thread pool. Hazards and goals never collide, so they
+are arrays here and not bodies in the physics model.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import mujoco
+import numpy as np
+from mujoco.batch import Batch, SimulationError
+from numpy.typing import NDArray
+
+from torchrl_safe.envs import tasks
+from torchrl_safe.envs._random import RandomStreams
+from torchrl_safe.envs.robots import Array, Motion, Robot
+from torchrl_safe.envs.tasks import GoalTask
+
+Rows = NDArray[np.integer]
+Mask = NDArray[np.bool_]
+
+# MuJoCo resets a simulation whose position, velocity or acceleration is huge or NaN, and counts it.
+_WARNING = mujoco.mjtWarning
+_DIVERGED = [
+    int(w) for w in (_WARNING.mjWARN_BADQPOS, _WARNING.mjWARN_BADQVEL, _WARNING.mjWARN_BADQACC)
+]
+
+
+class RobotBatch:
+    """N copies of a robot on a thread pool.
+
+    The pool is built at first use and left behind by pickling, which keeps the simulations' state;
+    rollouts do not depend on the number of threads.
+
+    Args:
+        robot (Robot): the robot.
+        num_envs (int): how many, N.
+        num_threads (int): threads that step them, this one included.
+
+    Attributes:
+        motion (Motion): where the robots are and what they sense. Its acceleration is that of the
+            last physics step: MuJoCo's derived fields lag behind the state by one.
+    """
+
+    def __init__(self, robot: Robot, num_envs: int, num_threads: int) -> None:
+        self.robot = robot
+        self.num_envs = num_envs
+        self.num_threads = num_threads
+        plane = np.zeros((num_envs, 2))
+        self.motion = Motion(plane, plane, np.zeros((num_envs, len(robot.proprioception_scale))))
+        self._batch: Batch | None = None
+        self._saved: Array | None = None
+
+    @property
+    def batch(self) -> Batch:
+        """The thread pool."""
+        if self._batch is None:
+            model = mujoco.MjModel.from_xml_path(str(self.robot.asset_path))
+            model.opt.timestep = self.robot.timestep
+            self._batch = batch = Batch(model, self.num_envs, self.num_threads)
+            self._initial = batch.state[0].copy()
+            self._qpos, self._qvel = batch.bind("qpos"), batch.bind("qvel")
+            self._ctrl, self._qacc = batch.bind("ctrl"), batch.bind("qacc")
+            if self._saved is not None:
+                batch.state[:] = self._saved
+                self._saved = None
+        return self._batch
+
+    def __getstate__(self) -> dict[str, Any]:
+        kept = ("robot", "num_envs", "num_threads", "motion")
+        saved = self._saved if self._batch is None else self._batch.state.copy()
+        return {name: getattr(self, name) for name in kept} | {"_batch": None, "_saved": saved}
+
+    @property
+    def state(self) -> Array:
+        """The live state, [N, S]: writing it is setting the simulations."""
+        return self.batch.state
+
+    def place(self, rows: Rows, position: Array, yaw: Array) -> None:
+        """Puts the robots ``rows`` at rest at position [n, 2] and yaw [n]."""
+        batch = self.batch
+        batch.state[rows] = self._initial
+        self._qpos[rows] = self.robot.place(position, yaw)
+        batch.forward(rows)
+        sensed = self.robot.sense(self._qpos[rows], self._qvel[rows], self._qacc[rows])
+        pairs = zip(self.motion, sensed, strict=True)
+        self.motion = Motion(*(_with_rows(old, rows, new) for old, new in pairs))
+
+    def step(self, action: Array) -> Mask:
+        """Advances all by one environment step under the actions [N, A].
+
+        Returns:
+            array: [N], the simulations that diverged; they are left as they were before the step.
+        """
+        batch = self.batch
+        before = batch.state.copy()
+        self._ctrl[:] = self.robot.control(action, self._qpos, self._qvel)
+        try:
+            batch.step(nstep=self.robot.substeps)
+            failed = np.zeros(self.num_envs, bool)
+        except SimulationError:
+            failed = batch.status != 0
+        failed |= batch.warning[:, _DIVERGED, 1].any(-1)
+        sensed = self.robot.sense(self._qpos, self._qvel, self._qacc)
+        if failed.any():
+            batch.state[failed] = before[failed]
+            batch.warning[failed] = 0
+            pairs = zip(sensed, self.motion, strict=True)
+            sensed = Motion(*(_with_rows(new, failed, old[failed]) for new, old in pairs))
+        self.motion = sensed
+        return failed
+
+
+class Frame(NamedTuple):
+    """What N environments show after a step or a reset: [N, D] float32, and [N] each."""
+
+    observation: NDArray[np.float32]
+    reward: Array
+    cost: Array
+    violation: Mask
+    goal_met: Mask
+    truncated: Mask
+
+
+class GoalCore:
+    """The goal task on N robots: layouts, episodes, rewards and costs.
+
+    A simulation that diverges is put back where it was, and its episode is truncated: it repeats
+    its last observation and cost without a reward, and nothing non-finite reaches a learner.
+    ``instabilities`` counts them.
+
+    Args:
+        robot (Robot): the robot.
+        task (GoalTask): the options of the task.
+        num_envs (int): number of environments, N.
+        num_threads (int): threads of the simulator.
+        seed (int or None): seed of the random streams, one per environment.
+        episode_length (int): steps after which an episode is truncated.
+        stagger (bool): whether a reset of all environments starts them at different phases of an
+            episode.
+
+    Raises:
+        ValueError: if an option is out of range or the objects do not fit the task's square.
+    """
+
+    def __init__(
+        self,
+        robot: Robot,
+        task: GoalTask,
+        *,
+        num_envs: int,
+        num_threads: int,
+        seed: int | None,
+        episode_length: int,
+        stagger: bool,
+    ) -> None:
+        for name, value in (
+            ("num_envs", num_envs),
+            ("num_threads", num_threads),
+            ("episode_length", episode_length),
+        ):
+            if not isinstance(value, int) or isinstance(value, bool) or value < 1:
+                raise ValueError(f"{name} must be an integer >= 1, got {value!r}.")
+        # Fail where the options are given, not at the first reset of a worker process.
+        tasks.sample_layout(task, robot.keepout, RandomStreams(0, 4), np.arange(4))
+        self.robot = robot
+        self.task = task
+        self.num_envs = num_envs
+        self.episode_length = episode_length
+        self.stagger = stagger
+        self.instabilities = 0
+        self.action_dim = robot.action_dim
+        self._scale = np.array(robot.proprioception_scale)
+        self.observation_size = tasks.observation_size(task, len(self._scale))
+        self._robots = RobotBatch(robot, num_envs, num_threads)
+        self._started = False
+        self._hazards = np.zeros((num_envs, task.num_hazards, 2))
+        self._goal = np.zeros((num_envs, 2))
+        self._goal_distance = np.zeros(num_envs)
+        self._elapsed = np.zeros(num_envs, np.int64)
+        zero, no = np.zeros(num_envs), np.zeros(num_envs, bool)
+        blank = np.zeros((num_envs, self.observation_size), np.float32)
+        self._frame = Frame(blank, zero, zero, no, no, no)
+        self.seed(seed)
+
+    def seed(self, seed: int | None) -> None:
+        """Restarts the random streams; the current layouts stay until they are reset."""
+        self._streams = RandomStreams(seed, self.num_envs)
+
+    def reset(self, mask: Mask | None = None) -> Frame:
+        """Starts new episodes.
+
+        Args:
+            mask (array, optional): [N], the environments to reset; the others keep their state and
+                show their current frame. All are reset if there is no mask, or nothing to keep yet.
+
+        Returns:
+            Frame: reward zero where reset.
+        """
+        if mask is None or not self._started:
+            rows: Rows = np.arange(self.num_envs)
+        else:
+            rows = np.flatnonzero(mask)
+        if not rows.size:
+            return self._frame
+        position, yaw, goal, hazards = tasks.sample_layout(
+            self.task, self.robot.keepout, self._streams, rows
+        )
+        self._robots.place(rows, position, yaw)
+        self._goal[rows], self._hazards[rows] = goal, hazards
+        self._goal_distance[rows] = np.hypot(*(goal - position).T)
+        staggered = self.stagger and mask is None
+        self._elapsed[rows] = rows * self.episode_length // self.num_envs if staggered else 0
+        self._started = True
+        motion = Motion(*(part[rows] for part in self._robots.motion))
+        scan, cost, violation = self._sense_hazards(motion, hazards)
+        fresh = Frame(
+            tasks.observe(motion, goal, scan, self._scale),
+            reward=np.zeros(len(rows)),
+            cost=cost,
+            violation=violation,
+            goal_met=np.zeros(len(rows), bool),
+            truncated=np.zeros(len(rows), bool),
+        )
+        pairs = zip(self._frame, fresh, strict=True)
+        self._frame = Frame(*(_with_rows(old, rows, new) for old, new in pairs))
+        return self._frame
+
+    def step(self, action: Array) -> Frame:
+        """Advances all environments by one step.
+
+        A reached goal moves within the step: the reward is measured to the old one, the
+        observation shows the new one. Episodes that are over go on until they are reset.
+
+        Args:
+            action (array): [N, A]; components outside [-1, 1] are clipped.
+
+        Returns:
+            Frame: after the step.
+
+        Raises:
+            ValueError: if the action has another shape or is not finite; nothing has moved then.
+            RuntimeError: before the first reset.
+        """
+        if not self._started:
+            raise RuntimeError("reset the environment before its first step.")
+        if action.shape != (self.num_envs, self.action_dim):
+            raise ValueError(
+                f"action must have shape {(self.num_envs, self.action_dim)}, got {action.shape}."
+            )
+        if not np.isfinite(action).all():
+            bad = np.flatnonzero(~np.isfinite(action).all(-1))
+            raise ValueError(f"action must be finite; it is not in environments {bad.tolist()}.")
+        failed = self._robots.step(np.clip(action, -1.0, 1.0))
+        self.instabilities += int(failed.sum())
+        motion = self._robots.motion
+        distance = np.hypot(*(self._goal - motion.position).T)
+        reward, goal_met = tasks.goal_reward(self.task, self._goal_distance, distance)
+        scan, cost, violation = self._sense_hazards(motion, self._hazards)
+        self._elapsed += 1
+        truncated = (self._elapsed >= self.episode_length) | failed
+        if goal_met.any():
+            rows = np.flatnonzero(goal_met)
+            position = motion.position[rows]
+            self._goal[rows] = tasks.sample_goal(
+                self.task, self.robot.keepout, position, self._hazards[rows], self._streams, rows
+            )
+            distance[rows] = np.hypot(*(self._goal[rows] - position).T)
+        self._goal_distance = distance
+        observation = tasks.observe(motion, self._goal, scan, self._scale)
+        self._frame = Frame(observation, reward, cost, violation, goal_met, truncated)
+        return self._frame
+
+    def layout(self, index: int) -> dict[str, Array]:
+        """Copies of robot [2], heading [2], goal [2], hazards [H, 2] of one environment, metres."""
+        motion = self._robots.motion
+        return {
+            "robot": motion.position[index].copy(),
+            "heading": motion.heading[index].copy(),
+            "goal": self._goal[index].copy(),
+            "hazards": self._hazards[index].copy(),
+        }
+
+    def qpos(self, index: int) -> Array:
+        """A copy of the generalised position [nq] of one environment."""
+        return self._robots.batch.bind("qpos")[index].copy()
+
+    @property
+    def frame(self) -> Frame:
+        """The current frame."""
+        return self._frame
+
+    def snapshot(self) -> dict[str, NDArray[Any]]:
+        """Copies of everything the future depends on: physics, layouts, clocks, random streams."""
+        state = {
+            "physics": self._robots.state,
+            **self._robots.motion._asdict(),
+            "hazards": self._hazards,
+            "goal": self._goal,
+            "goal_distance": self._goal_distance,
+            "elapsed": self._elapsed,
+            "random": self._streams.state,
+            "started": np.array(self._started),
+            "instabilities": np.array(self.instabilities),
+        }
+        frame = {f"frame_{name}": value for name, value in self._frame._asdict().items()}
+        return {name: np.array(value) for name, value in (state | frame).items()}
+
+    def restore(self, snapshot: dict[str, NDArray[Any]]) -> None:
+        """Puts a snapshot back; what follows is what followed it.
+
+        Raises:
+            ValueError: if the snapshot is of another number of environments, robot or task;
+                nothing has changed then.
+        """
+        current = self.snapshot()
+        if snapshot.keys() != current.keys():
+            raise ValueError(
+                f"snapshot must have the entries {sorted(current)}, got {sorted(snapshot)}."
+            )
+        for name, value in current.items():
+            new = snapshot[name]
+            if new.shape != value.shape or new.dtype != value.dtype:
+                raise ValueError(
+                    f"snapshot entry {name!r} must be {value.dtype} of shape {value.shape}, "
+                    f"got {new.dtype} of shape {new.shape}."
+                )
+        copy = {name: np.array(value) for name, value in snapshot.items()}
+        self._robots.state[:] = copy["physics"]
+        self._robots.motion = Motion(*(copy[name] for name in Motion._fields))
+        self._hazards, self._goal = copy["hazards"], copy["goal"]
+        self._goal_distance, self._elapsed = copy["goal_distance"], copy["elapsed"]
+        self._streams.state = copy["random"]
+        self._started = bool(copy["started"])
+        self.instabilities = int(copy["instabilities"])
+        self._frame = Frame(*(copy[f"frame_{name}"] for name in Frame._fields))
+
+    def _sense_hazards(self, motion: Motion, hazards: Array) -> tuple[Array, Array, Mask]:
+        offset, distance = tasks.hazard_distances(motion.position, hazards)
+        scan = tasks.lidar(self.task, offset, distance, motion.heading)
+        return scan, *tasks.hazard_cost(self.task, distance)
+
+
+def _with_rows(array: NDArray[Any], rows: Rows | Mask, new: NDArray[Any]) -> NDArray[Any]:
+    """A copy of ``array`` with other rows."""
+    out = array.copy()
+    out[rows] = new
+    return out

@@ -1,0 +1,146 @@
+"""The robots: a model, how an action drives it, and what it senses."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+_ASSETS = Path(__file__).parent / "assets"
+
+
+class Motion(NamedTuple):
+    """Where a batch of robots is and what it senses of its own motion.
+
+    Attributes:
+        position (array): [N, 2], metres, world frame.
+        heading (array): [N, 2], unit vector the robot faces, world frame.
+        proprioception (array): [N, P], what the robot senses of itself, in its own frame, unscaled.
+    """
+
+    position: Array
+    heading: Array
+    proprioception: Array
+
+
+@dataclass(frozen=True)
+class Robot:
+    """A robot, as the environments need to know it.
+
+    Args:
+        name (str): the name in the registry.
+        asset (str): the MJCF file, relative to the package's ``assets``.
+        timestep (float): seconds of one physics step.
+        substeps (int): physics steps in one environment step.
+        keepout (float): radius in metres of the free disc the robot starts in.
+        action_dim (int): size A of the action; every component is in [-1, 1].
+        proprioception_scale (tuple of float): what each of the P proprioceptive readings is
+            divided by in the observation.
+        place (callable): ``(position [N, 2], yaw [N]) -> qpos [N, nq]``, the robot at rest there.
+        control (callable): ``(action [N, A], qpos [N, nq], qvel [N, nv]) -> ctrl [N, nu]``.
+        sense (callable): ``(qpos [N, nq], qvel [N, nv], qacc [N, nv]) -> Motion``.
+
+    Examples:
+        >>> get_robot("point").substeps
+        10
+    """
+
+    name: str
+    asset: str
+    timestep: float
+    substeps: int
+    keepout: float
+    action_dim: int
+    proprioception_scale: tuple[float, ...]
+    place: Callable[[Array, Array], Array]
+    control: Callable[[Array, Array, Array], Array]
+    sense: Callable[[Array, Array, Array], Motion]
+
+    @property
+    def asset_path(self) -> Path:
+        """The MJCF file of the robot."""
+        return _ASSETS / self.asset
+
+
+def to_robot_frame(vector: Array, heading: Array) -> Array:
+    """World vectors seen from the robot: x ahead, y to the left.
+
+    Args:
+        vector (array): [..., 2].
+        heading (array): [..., 2], unit vectors.
+
+    Returns:
+        array: [..., 2].
+
+    Examples:
+        >>> import numpy as np
+        >>> to_robot_frame(np.array([0.0, 2.0]), np.array([0.0, 1.0])).tolist()
+        [2.0, 0.0]
+    """
+    x, y = vector[..., 0], vector[..., 1]
+    cos, sin = heading[..., 0], heading[..., 1]
+    out = np.empty_like(vector)
+    out[..., 0] = cos * x + sin * y
+    out[..., 1] = cos * y - sin * x
+    return out
+
+
+def _place_planar(position: Array, yaw: Array) -> Array:
+    return np.column_stack((position, yaw))
+
+
+def _control_directly(action: Array, qpos: Array, qvel: Array) -> Array:
+    return action
+
+
+def _sense_planar(qpos: Array, qvel: Array, qacc: Array) -> Motion:
+    """Acceleration xy, velocity xy and yaw rate of a robot on two slides and a hinge."""
+    heading = np.empty((len(qpos), 2))
+    np.cos(qpos[:, 2], out=heading[:, 0])
+    np.sin(qpos[:, 2], out=heading[:, 1])
+    proprioception = np.empty((len(qpos), 5))
+    proprioception[:, :2] = to_robot_frame(qacc[:, :2], heading)
+    proprioception[:, 2:4] = to_robot_frame(qvel[:, :2], heading)
+    proprioception[:, 4] = qvel[:, 2]
+    return Motion(qpos[:, :2].copy(), heading, proprioception)
+
+
+_POINT = Robot(
+    name="point",
+    asset="point.xml",
+    timestep=0.002,
+    substeps=10,
+    keepout=0.4,
+    action_dim=2,
+    proprioception_scale=(8.0, 8.0, 0.2, 0.2, 2.0),
+    place=_place_planar,
+    control=_control_directly,
+    sense=_sense_planar,
+)
+
+ROBOTS: dict[str, Robot] = {robot.name: robot for robot in (_POINT,)}
+
+
+def get_robot(name: str) -> Robot:
+    """The robot registered under a name.
+
+    Args:
+        name (str): a key of ``ROBOTS``.
+
+    Returns:
+        Robot: the robot.
+
+    Raises:
+        ValueError: if no robot has this name.
+    """
+    try:
+        return ROBOTS[name]
+    except KeyError:
+        known = ", ".join(map(repr, sorted(ROBOTS)))
+        raise ValueError(f"robot must be one of {known}, got {name!r}.") from None

@@ -1,0 +1,290 @@
+"""The goal task: layouts, lidar, reward, cost and observation over a batch, without a simulator.
+
+A robot drives to a goal disc among hazard discs, which do not block it but cost it to enter; a
+reached goal moves elsewhere. This is Safety Gym's ``Goal1`` without its vase, with the smooth cost
+and the reward of SafeTAC, equation (19).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import expit
+
+from torchrl_safe.envs._random import RandomStreams
+from torchrl_safe.envs.robots import Array, Motion, to_robot_frame
+
+_LAYOUT_CANDIDATES = 32  # positions tried for one object before its layout is started again
+_LAYOUT_ATTEMPTS = 100  # layouts started before giving up
+_GOAL_CANDIDATES = 256  # positions tried for a goal that moves during an episode
+
+# What the authors divide by, after shifting; the robot's own readings bring their scales with them.
+_DIRECTION_SCALE = 0.7
+_DISTANCE_SHIFT, _DISTANCE_SCALE = 1.5, 0.6
+_LIDAR_SHIFT, _LIDAR_SCALE = 0.3, 0.3
+
+
+@dataclass(frozen=True)
+class GoalTask:
+    """The options of the goal task; lengths in metres.
+
+    Args:
+        num_hazards (int): hazards in a layout, H.
+        extent (float): objects are placed in the square [-extent, extent]^2.
+        hazard_radius (float): radius of a hazard.
+        hazard_keepout (float): radius around a hazard's centre kept clear of other objects' own.
+        goal_radius (float): the goal is reached at this distance from its centre.
+        goal_keepout (float): as ``hazard_keepout``.
+        lidar_bins (int): angular bins of the lidar, B.
+        lidar_range (float): distance at which the lidar reads zero.
+        cost_slope (float): steepness of the cost at a hazard's rim, per metre.
+
+    Raises:
+        TypeError: if a count is no integer.
+        ValueError: if an option is out of range.
+
+    Examples:
+        >>> GoalTask(num_hazards=4).num_hazards
+        4
+    """
+
+    num_hazards: int = 8
+    extent: float = 1.5
+    hazard_radius: float = 0.2
+    hazard_keepout: float = 0.18
+    goal_radius: float = 0.3
+    goal_keepout: float = 0.305
+    lidar_bins: int = 16
+    lidar_range: float = 3.0
+    cost_slope: float = 10.0
+
+    def __post_init__(self) -> None:
+        for field in fields(self):
+            name, value = field.name, getattr(self, field.name)
+            if isinstance(field.default, int):
+                # With two bins or fewer the two neighbours of a bin coincide.
+                smallest = {"num_hazards": 0, "lidar_bins": 3}[name]
+                if not isinstance(value, int) or isinstance(value, bool):
+                    raise TypeError(f"{name} must be an int, got {value!r}.")
+                if value < smallest:
+                    raise ValueError(f"{name} must be at least {smallest}, got {value}.")
+            elif not isinstance(value, (int, float)) or not 0.0 < value < np.inf:
+                raise ValueError(f"{name} must be positive and finite, got {value!r}.")
+        if self.goal_keepout >= self.extent:
+            raise ValueError(
+                f"goal_keepout must be smaller than extent={self.extent}, got {self.goal_keepout}."
+            )
+        if self.num_hazards and self.hazard_keepout >= self.extent:
+            raise ValueError(
+                f"hazard_keepout must be smaller than extent={self.extent}, "
+                f"got {self.hazard_keepout}."
+            )
+
+
+def observation_size(task: GoalTask, proprioception_size: int) -> int:
+    """Length D of the observation: goal direction (2) and distance (1), proprioception, lidar."""
+    return 3 + proprioception_size + task.lidar_bins
+
+
+def sample_layout(
+    task: GoalTask, robot_keepout: float, streams: RandomStreams, rows: NDArray[np.integer]
+) -> tuple[Array, Array, Array, Array]:
+    """Draws where robot, goal and hazards start, clear of each other, in environments ``rows``.
+
+    Objects are drawn one after the other, uniformly in the square shrunk by their keepout, and
+    redrawn until their keepout discs do not overlap the earlier ones; an object that finds no
+    place starts its layout again.
+
+    Args:
+        task (GoalTask): the options.
+        robot_keepout (float): keepout of the robot, metres.
+        streams (RandomStreams): one stream per environment, advanced in place.
+        rows (array): [n], the environments to draw for.
+
+    Returns:
+        tuple of arrays: robot [n, 2], yaw [n], goal [n, 2], hazards [n, H, 2].
+
+    Raises:
+        ValueError: if some environment found no layout: the objects do not fit the square.
+    """
+    keepout = np.array(
+        (robot_keepout, task.goal_keepout) + (task.hazard_keepout,) * task.num_hazards
+    )
+    count = len(keepout)
+    half = task.extent - keepout
+    if half.min() < 0.0:
+        raise ValueError(f"a keepout of {keepout.max()} does not fit an extent of {task.extent}.")
+    gap = keepout[:, None] + keepout
+    # Positions are complex numbers here: a distance is one absolute value.
+    layout = np.empty((len(rows), count), complex)
+    pending = np.arange(len(rows))
+    for _ in range(_LAYOUT_ATTEMPTS):
+        draws = streams.uniform(rows[pending], count * _LAYOUT_CANDIDATES * 2) * 2.0 - 1.0
+        candidates = draws.view(complex).reshape(-1, count, _LAYOUT_CANDIDATES) * half[:, None]
+        placed = candidates[:, :, 0].copy()
+        legal = np.ones(len(pending), bool)
+        index = np.arange(len(pending))
+        for j in range(1, count):
+            distance = np.abs(candidates[:, j, :, None] - placed[:, None, :j])
+            free = (distance >= gap[j, :j]).all(-1)
+            first = free.argmax(-1)
+            legal &= free[index, first]
+            placed[:, j] = candidates[index, j, first]
+        layout[pending[legal]] = placed[legal]
+        pending = pending[~legal]
+        if not pending.size:
+            yaw = streams.uniform(rows, 1)[:, 0] * (2.0 * np.pi)
+            xy = layout.view(float).reshape(-1, count, 2)
+            return xy[:, 0], yaw, xy[:, 1], xy[:, 2:]
+    raise ValueError(
+        f"no legal layout found in {_LAYOUT_ATTEMPTS} attempts for {task} with a robot keepout of "
+        f"{robot_keepout}: use fewer hazards, smaller keepouts or a larger extent."
+    )
+
+
+def sample_goal(
+    task: GoalTask,
+    robot_keepout: float,
+    robot: Array,
+    hazards: Array,
+    streams: RandomStreams,
+    rows: NDArray[np.integer],
+) -> Array:
+    """Draws a new goal clear of hazards and robot, for the environments ``rows``.
+
+    The first legal one of 256 uniform candidates is taken. A robot in the middle of a crowded
+    layout can leave no legal place at all: then the candidate with the most clearance is taken, so
+    the draw always ends.
+
+    Args:
+        task (GoalTask): the options.
+        robot_keepout (float): keepout of the robot, metres.
+        robot (array): [n, 2].
+        hazards (array): [n, H, 2].
+        streams (RandomStreams): one stream per environment, advanced in place.
+        rows (array): [n], the environments to draw for.
+
+    Returns:
+        array: [n, 2].
+    """
+    draws = streams.uniform(rows, 2 * _GOAL_CANDIDATES).reshape(-1, _GOAL_CANDIDATES, 2)
+    candidates = (draws * 2.0 - 1.0) * (task.extent - task.goal_keepout)
+    clearance = _norm(candidates - robot[:, None]) - robot_keepout
+    if task.num_hazards:
+        to_hazards = _norm(candidates[:, :, None] - hazards[:, None]).min(-1) - task.hazard_keepout
+        clearance = np.minimum(clearance, to_hazards)
+    legal = clearance >= task.goal_keepout
+    choice = np.where(legal.any(-1), legal.argmax(-1), clearance.argmax(-1))
+    return candidates[np.arange(len(rows)), choice]
+
+
+def hazard_distances(position: Array, hazards: Array) -> tuple[Array, Array]:
+    """Offsets [N, H, 2] and distances [N, H] from the robots [N, 2] to the hazards [N, H, 2]."""
+    offset = hazards - position[:, None]
+    return offset, _norm(offset)
+
+
+def lidar(task: GoalTask, offset: Array, distance: Array, heading: Array) -> Array:
+    """Nearness of the hazards around the robot, by direction.
+
+    A hazard at distance d reads ``max(0, 1 - d / lidar_range)`` in the bin it lies in, and that
+    times its position within the bin in the next one, times the complement in the previous one; a
+    bin keeps its largest reading. Bin 0 starts straight ahead, bins count to the left.
+
+    Args:
+        task (GoalTask): the options.
+        offset (array): [N, H, 2], hazard minus robot, world frame.
+        distance (array): [N, H].
+        heading (array): [N, 2].
+
+    Returns:
+        array: [N, B] in [0, 1].
+    """
+    bins, num_envs = task.lidar_bins, len(offset)
+    ahead = to_robot_frame(offset, heading[:, None])
+    turn = np.arctan2(ahead[..., 1], ahead[..., 0]) * (bins / (2.0 * np.pi))
+    turn += bins * (turn < 0.0)
+    centre = turn.astype(np.intp)
+    within = turn - centre
+    reading = np.maximum(0.0, 1.0 - distance / task.lidar_range)
+    # Column b + 1 is bin b. The margins, where neighbours across the seam fall, are folded back
+    # below; there are two on the right because an angle just below zero can round up to a full
+    # turn.
+    scan = np.zeros((num_envs, bins + 3))
+    flat = scan.reshape(-1)
+    previous = (np.arange(num_envs)[:, None] * (bins + 3) + centre).ravel()
+    np.maximum.at(flat, previous, ((1.0 - within) * reading).ravel())
+    np.maximum.at(flat, previous + 1, reading.ravel())
+    np.maximum.at(flat, previous + 2, (within * reading).ravel())
+    scan[:, 1:3] = np.maximum(scan[:, 1:3], scan[:, -2:])
+    scan[:, bins] = np.maximum(scan[:, bins], scan[:, 0])
+    return scan[:, 1:-2]
+
+
+def goal_reward(task: GoalTask, before: Array, after: Array) -> tuple[Array, NDArray[np.bool_]]:
+    """SafeTAC equation (19): progress to the goal, and one for reaching it.
+
+    ``before - after + 1[after <= goal_radius]``, both distances to the goal the step started with.
+    (As printed, the bonus reads the distance before the step; with a reached goal moved at once it
+    would never be paid.)
+
+    Args:
+        task (GoalTask): the options.
+        before (array): [N], distance to the goal before the step.
+        after (array): [N], distance to the same goal after it.
+
+    Returns:
+        tuple of arrays: reward [N] and whether the goal is reached [N].
+    """
+    reached = after <= task.goal_radius
+    return before - after + reached, reached
+
+
+def hazard_cost(task: GoalTask, distance: Array) -> tuple[Array, NDArray[np.bool_]]:
+    """SafeTAC equation (19): ``sigmoid(cost_slope (hazard_radius - d))`` of the nearest hazard.
+
+    Args:
+        task (GoalTask): the options.
+        distance (array): [N, H], distances to the hazards after the step.
+
+    Returns:
+        tuple of arrays: cost [N] in [0, 1], and whether the robot is inside a hazard [N].
+    """
+    nearest = distance.min(-1, initial=np.inf)
+    return expit(task.cost_slope * (task.hazard_radius - nearest)), nearest <= task.hazard_radius
+
+
+def observe(
+    motion: Motion, goal: Array, scan: Array, proprioception_scale: Array
+) -> NDArray[np.float32]:
+    """The observation, with the fixed scaling of the authors.
+
+    Goal direction in the robot frame / .7 (2), (goal distance - 1.5) / .6, proprioception / its
+    scale (P), (lidar - .3) / .3 (B).
+
+    Args:
+        motion (Motion): the robots.
+        goal (array): [N, 2].
+        scan (array): [N, B], the lidar.
+        proprioception_scale (array): [P].
+
+    Returns:
+        array: [N, 3 + P + B], float32.
+    """
+    offset = goal - motion.position
+    distance = _norm(offset)
+    # A robot exactly on the goal has no direction to it: zero.
+    direction = offset / np.maximum(distance, 1e-12)[:, None]
+    size = motion.proprioception.shape[1]
+    out = np.empty((len(goal), 3 + size + scan.shape[1]), np.float32)
+    out[:, :2] = to_robot_frame(direction, motion.heading) / _DIRECTION_SCALE
+    out[:, 2] = (distance - _DISTANCE_SHIFT) / _DISTANCE_SCALE
+    out[:, 3 : 3 + size] = motion.proprioception / proprioception_scale
+    out[:, 3 + size :] = (scan - _LIDAR_SHIFT) / _LIDAR_SCALE
+    return out
+
+
+def _norm(vector: Array) -> Array:
+    return np.hypot(vector[..., 0], vector[..., 1])

@@ -1,0 +1,237 @@
+"""The equations of the objectives, one pure function each.
+
+Equation numbers are those of SafeTAC (Kim, Heo and Oh); modules wire tensordict keys to these
+functions and add nothing to them.
+"""
+
+from __future__ import annotations
+
+import math
+from statistics import NormalDist
+
+import torch
+from torch import Tensor
+
+__all__ = [
+    "cvar_factor",
+    "discounted_cost_limit",
+    "gaussian_cvar",
+    "moment_matched_kl",
+    "q_logarithm",
+    "uniform_tsallis_entropy",
+]
+
+# exp(10) = 2e4: far above what a density bounded by log_std >= -4 earns where it matters, far
+# below what a float32 gradient overflows at.
+_MAX_EXPONENT = 10.0
+
+
+def q_logarithm(log_prob: Tensor, entropic_index: float) -> Tensor:
+    r"""The q-logarithm of a density, computed from its log-density (2).
+
+    .. math::
+
+        \ln_q(x) = \frac{x^{q-1} - 1}{q - 1}, \qquad \ln_1(x) = \log(x).
+
+    Above ``(q - 1) * log_prob = 10`` the exponential is continued by its tangent: the result
+    stays increasing in ``log_prob``, and its gradient stays finite (at most ``exp(10)``) where
+    a squashed density grows without bound.
+
+    Args:
+        log_prob (Tensor): log-density of any shape, ``[*B]``.
+        entropic_index (float): ``q > 0``.
+
+    Returns:
+        The q-logarithm, of the shape of ``log_prob``.
+
+    Raises:
+        ValueError: if ``entropic_index`` is not a positive finite number.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_safe.objectives.functional import q_logarithm
+        >>> log_prob = torch.tensor([2.0, 0.5]).log()
+        >>> q_logarithm(log_prob, 2.0)  # x - 1
+        tensor([ 1.0000, -0.5000])
+        >>> torch.equal(q_logarithm(log_prob, 1.0), log_prob)
+        True
+    """
+    check_entropic_index(entropic_index)
+    order = entropic_index - 1.0
+    if order == 0.0:
+        return log_prob
+    exponent = order * log_prob
+    bounded = exponent.clamp(max=_MAX_EXPONENT)
+    excess = exponent - bounded
+    return (torch.expm1(bounded) + math.exp(_MAX_EXPONENT) * excess) / order
+
+
+def uniform_tsallis_entropy(shannon_entropy: float, entropic_index: float) -> float:
+    """Tsallis entropy of the uniform density that has the given Shannon entropy.
+
+    It carries a Shannon target entropy over to another entropic index: a uniform density of
+    volume ``exp(h)`` has Shannon entropy ``h`` and Tsallis entropy ``-ln_q(exp(-h))``.
+
+    Args:
+        shannon_entropy (float): ``h``, in nats.
+        entropic_index (float): ``q > 0``.
+
+    Examples:
+        >>> from torchrl_safe.objectives.functional import uniform_tsallis_entropy
+        >>> uniform_tsallis_entropy(-2.0, 1.0)
+        -2.0
+    """
+    log_density = torch.tensor(-shannon_entropy, dtype=torch.float64)
+    return -q_logarithm(log_density, entropic_index).item()
+
+
+def cvar_factor(risk_level: float) -> float:
+    r"""Standard deviations between a Gaussian's mean and its CVaR (7).
+
+    .. math::
+
+        \frac{\phi(\Phi^{-1}(\alpha))}{\alpha}
+
+    Args:
+        risk_level (float): share of worst outcomes that are averaged, in (0, 1]; 1 averages all
+            of them, which is the plain expectation.
+
+    Raises:
+        ValueError: if ``risk_level`` is outside (0, 1].
+
+    Examples:
+        >>> from torchrl_safe.objectives.functional import cvar_factor
+        >>> round(cvar_factor(0.125), 4), cvar_factor(1.0)
+        (1.6468, 0.0)
+    """
+    check_risk_level(risk_level)
+    if risk_level == 1.0:
+        return 0.0
+    normal = NormalDist()
+    return normal.pdf(normal.inv_cdf(risk_level)) / risk_level
+
+
+def gaussian_cvar(mean: Tensor, std: Tensor, risk_level: float) -> Tensor:
+    r"""Conditional value at risk of a Gaussian: the mean of its worst outcomes (5), (7).
+
+    .. math::
+
+        \Gamma = \mu + \frac{\phi(\Phi^{-1}(\alpha))}{\alpha} \sigma
+
+    Args:
+        mean (Tensor): ``[*B]``.
+        std (Tensor): standard deviation, ``[*B]``, in the unit of ``mean``.
+        risk_level (float): in (0, 1]; see :func:`cvar_factor`.
+
+    Returns:
+        The CVaR, ``[*B]``, in the unit of ``mean``.
+
+    Raises:
+        ValueError: if ``risk_level`` is outside (0, 1].
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_safe.objectives.functional import gaussian_cvar
+        >>> gaussian_cvar(torch.tensor(1.0), torch.tensor(2.0), risk_level=0.5)
+        tensor(2.5958)
+    """
+    return mean + cvar_factor(risk_level) * std
+
+
+def discounted_cost_limit(cost_rate: float, gamma: float) -> float:
+    """Limit on the discounted cost sum that a constant cost per step adds up to.
+
+    Every ``cost_limit`` of this library is a limit on the *discounted sum* of costs, the
+    quantity that the safety critic predicts. This converts a limit on the cost per step.
+
+    Args:
+        cost_rate (float): cost per step, at least 0.
+        gamma (float): discount of the safety critic, in [0, 1).
+
+    Raises:
+        ValueError: if an argument is out of its range.
+
+    Examples:
+        >>> from torchrl_safe.objectives.functional import discounted_cost_limit
+        >>> round(discounted_cost_limit(0.025, gamma=0.99), 6)
+        2.5
+    """
+    if not cost_rate >= 0:
+        raise ValueError(f"cost_rate must be at least 0, got {cost_rate}.")
+    if not 0 <= gamma < 1:
+        raise ValueError(f"gamma must be in [0, 1), got {gamma}.")
+    return cost_rate / (1 - gamma)
+
+
+def moment_matched_kl(
+    old_mean: Tensor, old_cov: Tensor, new_mean: Tensor, new_cov: Tensor
+) -> Tensor:
+    """KL divergence between two Gaussians, the trust region's distance of mixtures (15).
+
+    Given the moments of two mixtures it is the moment-matching approximation of Hershey and
+    Olsen (2007); for single Gaussians it is exact.
+
+    Args:
+        old_mean (Tensor): ``[*B, D]``.
+        old_cov (Tensor): full covariance, ``[*B, D, D]``.
+        new_mean (Tensor): ``[*B, D]``.
+        new_cov (Tensor): ``[*B, D, D]``.
+
+    Returns:
+        ``KL(old || new)`` in nats, ``[*B]``.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_safe.objectives.functional import moment_matched_kl
+        >>> mean, cov = torch.zeros(2), torch.eye(2)
+        >>> moment_matched_kl(mean, cov, mean + 1.0, cov)
+        tensor(1.)
+    """
+    new_factor, old_factor = _cholesky(new_cov), _cholesky(old_cov)
+    dim = range(old_mean.shape[-1])
+    zero = torch.zeros_like(old_mean[..., 0])
+    columns = [[old_factor[i][j] if j <= i else zero for i in dim] for j in dim]
+    shift = list((new_mean - old_mean).unbind(-1))
+    squares = [x.square() for b in (*columns, shift) for x in _solve_lower(new_factor, b)]
+    half_log_dets = [(new_factor[i][i] / old_factor[i][i]).log() for i in dim]
+    return torch.stack(squares).sum(0).sub(len(dim)).mul(0.5) + torch.stack(half_log_dets).sum(0)
+
+
+# Action spaces are small and batches large: unrolled over the action dimensions, products with
+# the Hessian of the KL are ten times as fast as through batched LAPACK calls.
+
+
+def _cholesky(cov: Tensor) -> list[list[Tensor]]:
+    """Lower factor of ``[*B, D, D]``, as rows of entries ``[*B]``."""
+    factor: list[list[Tensor]] = []
+    for i in range(cov.shape[-1]):
+        row: list[Tensor] = []
+        for j in range(i + 1):
+            entry = cov[..., i, j]
+            for k in range(j):
+                entry = entry - row[k] * (row[k] if i == j else factor[j][k])
+            row.append(entry.sqrt() if i == j else entry / factor[j][j])
+        factor.append(row)
+    return factor
+
+
+def _solve_lower(factor: list[list[Tensor]], b: list[Tensor]) -> list[Tensor]:
+    """Forward substitution."""
+    x: list[Tensor] = []
+    for row, entry in zip(factor, b, strict=True):
+        for coefficient, known in zip(row, x, strict=False):
+            entry = entry - coefficient * known
+        x.append(entry / row[-1])
+    return x
+
+
+def check_entropic_index(entropic_index: float) -> None:
+    """Raise a ``ValueError`` unless ``entropic_index`` is a positive finite number."""
+    if not 0 < entropic_index < math.inf:
+        raise ValueError(f"entropic_index must be a positive finite number, got {entropic_index}.")
+
+
+def check_risk_level(risk_level: float) -> None:
+    """Raise a ``ValueError`` unless ``risk_level`` is in (0, 1]."""
+    if not 0 < risk_level <= 1:
+        raise ValueError(f"risk_level must be in (0, 1], got {risk_level}.")

@@ -1,0 +1,17 @@
+"""Value estimation: Retrace targets as functions and as a TorchRL value estimator."""
+
+from __future__ import annotations
+
+from torchrl_safe.objectives.value.advantages import RetraceEstimator
+from torchrl_safe.objectives.value.functional import (
+    retrace_lambda_return_estimate,
+    retrace_variance_reward,
+    squared_td_error,
+)
+
+__all__ = [
+    "RetraceEstimator",
+    "retrace_lambda_return_estimate",
+    "retrace_variance_reward",
+    "squared_td_error",
+]

@@ -1,0 +1,303 @@
+"""Off-policy multi-step targets: one pure function per equation."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+__all__ = ["retrace_lambda_return_estimate", "retrace_variance_reward", "squared_td_error"]
+
+
+def retrace_lambda_return_estimate(
+    gamma: float | Tensor,
+    lmbda: float | Tensor,
+    log_pi: Tensor,
+    log_mu: Tensor,
+    action_value: Tensor,
+    next_state_value: Tensor,
+    reward: Tensor,
+    done: Tensor,
+    terminated: Tensor | None = None,
+    *,
+    time_dim: int = -2,
+) -> Tensor:
+    r"""Retrace(:math:`\lambda`) target of an action value, vectorised over time.
+
+    From "Safe and efficient off-policy reinforcement learning", Munos et al., 2016
+    (https://arxiv.org/abs/1606.02647), in the form of SafeTAC (18):
+
+    .. math::
+
+        Q^{ret}_t = r_t + \gamma (1 - term_t) V(s_{t+1})
+            + \gamma \lambda (1 - done_t) \rho_{t+1}
+              \left(Q^{ret}_{t+1} - Q(s_{t+1}, a_{t+1})\right),
+        \qquad \rho_t = \min\left(1, \frac{\pi(a_t | s_t)}{\mu(a_t | s_t)}\right).
+
+    Every argument is aligned with its own step ``t``; the shift to ``t + 1`` is made within.
+    ``done`` cuts the trace and ``terminated`` masks the bootstrap: a truncated step, wherever it
+    lies in the batch, bootstraps from its own ``next_state_value`` and never reads the trajectory
+    stored after it. The trace ends with the last step.
+
+    ``T`` steps take ``log2(T)`` rounds of tensor operations without a division, so ratios of zero
+    are harmless. The result is differentiable in every floating-point argument.
+
+    Args:
+        gamma (float or Tensor): discount in [0, 1]. A tensor has one element, or as many
+            dimensions as ``reward`` and broadcasts to it (a discount per step).
+        lmbda (float or Tensor): trace decay in [0, 1]; tensors as for ``gamma``.
+        log_pi (Tensor): log-density of the stored action under the current policy,
+            ``[*B, T, 1]``, shared by all features.
+        log_mu (Tensor): log-density of the stored action under the policy that took it,
+            ``[*B, T, 1]``.
+        action_value (Tensor): :math:`Q(s_t, a_t)`, ``[*B, T, F]``.
+        next_state_value (Tensor): :math:`V(s_{t+1})`, the value of the next state under the
+            current policy, ``[*B, T, F]``. Not read where ``terminated`` (may be NaN there).
+        reward (Tensor): reward of the step, ``[*B, T, F]``.
+        done (Tensor): boolean end of trajectory: termination, truncation or end of a slice,
+            ``[*B, T, F]``.
+        terminated (Tensor, optional): boolean end of episode, ``[*B, T, F]``. Defaults to ``done``.
+
+    Keyword Args:
+        time_dim (int): the dimension of time, any but the last. Defaults to ``-2``.
+
+    Returns:
+        Tensor: the targets, ``[*B, T, F]``.
+
+    Raises:
+        TypeError: if ``done`` or ``terminated`` is not boolean.
+        ValueError: if shapes disagree, if ``time_dim`` is not one of the dimensions before the
+            last, or if a coefficient given as a number is outside [0, 1].
+
+    Examples:
+        The second of three steps is truncated. It bootstraps and is worth 2 + 10 / 2; the first
+        adds gamma lmbda rho = .5 * 1 * .25 times that to its own 1 + 10 / 2:
+
+        >>> import torch
+        >>> reward = torch.tensor([[1.0], [2.0], [4.0]])
+        >>> done = torch.tensor([[False], [True], [False]])
+        >>> terminated = torch.zeros_like(done)
+        >>> value, next_value = torch.zeros(3, 1), torch.full((3, 1), 10.0)
+        >>> log_pi, log_mu = torch.tensor([[0.5], [0.25], [8.0]]).log(), torch.zeros(3, 1)
+        >>> target = retrace_lambda_return_estimate(
+        ...     0.5, 1.0, log_pi, log_mu, value, next_value, reward, done, terminated
+        ... )
+        >>> target.squeeze(-1)
+        tensor([6.8750, 7.0000, 9.0000])
+
+    """
+    terminated = done if terminated is None else terminated
+    shape = reward.shape
+    _check_time_dim(time_dim, shape)
+    for name, tensor in (
+        ("action_value", action_value),
+        ("next_state_value", next_state_value),
+        ("done", done),
+        ("terminated", terminated),
+    ):
+        _check_shape(name, tensor, shape, "that of reward")
+    for name, tensor in (("log_pi", log_pi), ("log_mu", log_mu)):
+        _check_shape(name, tensor, (*shape[:-1], 1), "that of reward with one feature")
+    _check_boolean("done", done)
+    _check_boolean("terminated", terminated)
+    gamma = _coefficient("gamma", gamma, shape)
+    lmbda = _coefficient("lmbda", lmbda, shape)
+
+    target = reward + gamma * torch.where(terminated, 0, next_state_value)
+    decay = gamma * lmbda
+    if isinstance(decay, Tensor) and decay.ndim:
+        decay = decay.expand(shape).movedim(time_dim, -1)[..., :-1]
+    log_pi, log_mu, action_value, target, done = (
+        tensor.movedim(time_dim, -1) for tensor in (log_pi, log_mu, action_value, target, done)
+    )
+    # Across a cut the ratio is another trajectory's: masking it before the exponential stops its
+    # gradient too, and a NaN in either.
+    log_ratio = torch.where(done[..., :-1], -torch.inf, (log_pi - log_mu)[..., 1:])
+    trace = decay * log_ratio.clamp(max=0).exp()
+    correction = trace * action_value[..., 1:]
+    delta = torch.cat([target[..., :-1] - correction, target[..., -1:]], -1)
+    return _reverse_linear_recurrence(trace, delta).movedim(-1, time_dim)
+
+
+def retrace_variance_reward(
+    gamma: float | Tensor,
+    cost: Tensor,
+    action_value: Tensor,
+    next_action_value: Tensor,
+    terminated: Tensor,
+) -> Tensor:
+    r"""Reward of the Retrace recursion whose value is the variance of the discounted cost sum.
+
+    SafeTAC (18): the variance :math:`V_C` of the cost sum obeys the recursion of the cost value
+    :math:`Q_C`, with the discount :math:`\gamma^2` and the reward
+
+    .. math::
+
+        \left(c_t + \gamma (1 - term_t) Q_C(s_{t+1}, a'_{t+1})\right)^2 - Q_C(s_t, a_t)^2,
+        \qquad a'_{t+1} \sim \pi(\cdot | s_{t+1}).
+
+    Its variance target therefore is :func:`retrace_lambda_return_estimate` with
+    ``gamma**2``, this reward, and the variance critic's values.
+
+    .. note::
+        :math:`a'` is a sample. A mean of :math:`Q_C` over actions in its place would leave out of
+        the square how much :math:`Q_C` varies between the actions, and underestimate the variance.
+
+    Args:
+        gamma (float or Tensor): discount of the cost in [0, 1]; a tensor has one element, or as
+            many dimensions as ``cost`` and broadcasts to it.
+        cost (Tensor): cost of the step, ``[*B, T, F]``.
+        action_value (Tensor): :math:`Q_C(s_t, a_t)`, ``[*B, T, F]``.
+        next_action_value (Tensor): :math:`Q_C(s_{t+1}, a'_{t+1})`, ``[*B, T, F]``. Not read where
+            ``terminated`` (may be NaN there).
+        terminated (Tensor): boolean end of episode, ``[*B, T, F]``.
+
+    Returns:
+        Tensor: the reward, ``[*B, T, F]``, in squared units of the cost.
+
+    Raises:
+        TypeError: if ``terminated`` is not boolean.
+        ValueError: if shapes disagree, or a ``gamma`` given as a number is outside [0, 1].
+
+    Examples:
+        A fair coin pays 0 or 2 and ends the episode: mean 1, variance 1.
+
+        >>> import torch
+        >>> gamma, lmbda = 0.9, 0.97
+        >>> cost = torch.tensor([[0.0], [2.0]])
+        >>> done = torch.tensor([[True], [True]])
+        >>> mean, log_prob = torch.ones(2, 1), torch.zeros(2, 1)
+        >>> variance = next_variance = torch.zeros(2, 1)
+        >>> reward = retrace_variance_reward(gamma, cost, mean, mean, done)
+        >>> retrace_lambda_return_estimate(
+        ...     gamma**2, lmbda, log_prob, log_prob, variance, next_variance, reward, done
+        ... ).mean()
+        tensor(1.)
+
+    """
+    one_step = _one_step_cost(gamma, cost, action_value, next_action_value, terminated)
+    return one_step.square() - action_value.square()
+
+
+def squared_td_error(
+    gamma: float | Tensor,
+    cost: Tensor,
+    action_value: Tensor,
+    next_action_value: Tensor,
+    terminated: Tensor,
+) -> Tensor:
+    r"""Reward of the variance recursion with the noise of its mean removed.
+
+    With :math:`\delta = c_t + \gamma (1 - term_t) Q_C(s_{t+1}, a'_{t+1}) - Q_C(s_t, a_t)`, the reward
+    of :func:`retrace_variance_reward` is :math:`\delta^2 + 2 Q_C(s_t, a_t) \delta`. Where
+    :math:`Q_C` solves its Bellman equation, :math:`\delta` has mean zero, so that
+    :math:`\delta^2` alone has the same mean; it is never negative, and it lacks the term that
+    grows with :math:`Q_C` and drowns the variance (Sherstan et al. 2018,
+    https://arxiv.org/abs/1801.08287). Where :math:`Q_C` is off by a bias, the square of the
+    bias is added.
+
+    Args:
+        gamma (float or Tensor): discount of the cost in [0, 1].
+        cost (Tensor): cost of the step, ``[*B, T, F]``.
+        action_value (Tensor): :math:`Q_C(s_t, a_t)`, ``[*B, T, F]``.
+        next_action_value (Tensor): :math:`Q_C(s_{t+1}, a'_{t+1})` at a sampled action,
+            ``[*B, T, F]``. Not read where ``terminated``.
+        terminated (Tensor): boolean end of episode, ``[*B, T, F]``.
+
+    Returns:
+        Tensor: the reward, ``[*B, T, F]``, in squared units of the cost.
+
+    Raises:
+        TypeError: if ``terminated`` is not boolean.
+        ValueError: if shapes disagree, or a ``gamma`` given as a number is outside [0, 1].
+
+    Examples:
+        >>> import torch
+        >>> cost, done = torch.tensor([[0.0], [2.0]]), torch.tensor([[True], [True]])
+        >>> mean = torch.ones(2, 1)
+        >>> squared_td_error(0.9, cost, mean, mean, done).mean()  # a fair coin paying 0 or 2
+        tensor(1.)
+    """
+    one_step = _one_step_cost(gamma, cost, action_value, next_action_value, terminated)
+    return (one_step - action_value).square()
+
+
+def _one_step_cost(
+    gamma: float | Tensor,
+    cost: Tensor,
+    action_value: Tensor,
+    next_action_value: Tensor,
+    terminated: Tensor,
+) -> Tensor:
+    """``c + gamma (1 - term) Q(s', a')`` of checked arguments."""
+    for name, tensor in (
+        ("action_value", action_value),
+        ("next_action_value", next_action_value),
+        ("terminated", terminated),
+    ):
+        _check_shape(name, tensor, cost.shape, "that of cost")
+    _check_boolean("terminated", terminated)
+    gamma = _coefficient("gamma", gamma, cost.shape)
+    return cost + gamma * torch.where(terminated, 0, next_action_value)
+
+
+def _reverse_linear_recurrence(coefficient: Tensor, delta: Tensor) -> Tensor:
+    """Solve ``x[t] = delta[t] + coefficient[t] * x[t + 1]``, ``x[T - 1] = delta[T - 1]``.
+
+    By doubling: after each round ``delta[t]`` sums twice as many steps, and ``coefficient[t]`` is
+    the product of as many coefficients. Those whose window would pass the end are dropped.
+
+    Args:
+        coefficient (Tensor): ``[..., T - 1]``, broadcasting with ``delta``.
+        delta (Tensor): ``[..., T]``.
+
+    Returns:
+        Tensor: ``x``, ``[..., T]``.
+
+    """
+    stride = 1
+    while stride < delta.shape[-1]:
+        head = torch.addcmul(delta[..., :-stride], coefficient, delta[..., stride:])
+        delta = torch.cat([head, delta[..., -stride:]], -1)
+        coefficient = coefficient[..., :-stride] * coefficient[..., stride:]
+        stride *= 2
+    return delta
+
+
+def _coefficient(name: str, value: float | Tensor, shape: Sequence[int]) -> float | Tensor:
+    """Check a discount: the value of a number, the shape of a tensor (its values stay unread)."""
+    if not isinstance(value, Tensor):
+        if not 0 <= value <= 1:
+            raise ValueError(f"{name} must be in [0, 1], got {value}.")
+        return value
+    if value.numel() == 1:
+        return value.reshape(())
+    sizes = zip(value.shape, shape, strict=False)
+    if value.ndim != len(shape) or any(size not in (1, full) for size, full in sizes):
+        raise ValueError(
+            f"{name} must be a number, a tensor with one element, or one that broadcasts to "
+            f"{tuple(shape)} with as many dimensions, got a tensor of shape {tuple(value.shape)}."
+        )
+    return value
+
+
+def _check_time_dim(time_dim: int, shape: Sequence[int]) -> None:
+    ndim = len(shape)
+    if not (-ndim <= time_dim < ndim - 1 and time_dim != -1):
+        raise ValueError(
+            f"time_dim must be a dimension of reward other than its last, of features; got "
+            f"time_dim={time_dim} for shape {tuple(shape)}."
+        )
+
+
+def _check_shape(name: str, tensor: Tensor, expected: Sequence[int], origin: str) -> None:
+    if tuple(tensor.shape) != tuple(expected):
+        raise ValueError(
+            f"{name} must have shape {tuple(expected)}, {origin}, got {tuple(tensor.shape)}."
+        )
+
+
+def _check_boolean(name: str, tensor: Tensor) -> None:
+    if tensor.dtype != torch.bool:
+        raise TypeError(f"{name} must be boolean, got {tensor.dtype}.")

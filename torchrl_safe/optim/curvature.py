@@ -1,0 +1,194 @@
+"""Curvature of the trust region: products with the KL's Hessian, and conjugate gradients."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+
+Statistics = Tensor | TensorDictBase
+StatisticsKL = Callable[[Statistics, Statistics], Tensor]
+Product = Callable[[Tensor], Tensor]
+
+
+def flatten(tensors: Sequence[Tensor]) -> Tensor:
+    """Concatenates tensors into one vector, shape [n]."""
+    return torch.cat([tensor.reshape(-1) for tensor in tensors])
+
+
+def unflatten(vector: Tensor, like: Sequence[Tensor]) -> list[Tensor]:
+    """Splits a vector of shape [n] into tensors shaped as ``like``."""
+    chunks = vector.split([tensor.numel() for tensor in like])
+    return [chunk.view(tensor.shape) for chunk, tensor in zip(chunks, like, strict=True)]
+
+
+def hessian_product(kl: Tensor, params: Sequence[Tensor]) -> Product:
+    """Products with the Hessian of ``kl``, by double backward.
+
+    Args:
+        kl (torch.Tensor): scalar, a function of ``params``.
+        params (sequence of torch.Tensor): the parameters, n numbers in all.
+
+    Returns:
+        callable: from vectors [k, n] to ``H v`` [k, n].
+
+    Examples:
+        >>> x = torch.tensor([1.0, 2.0], requires_grad=True)
+        >>> hessian_product((x**3).sum(), [x])(torch.eye(2))
+        tensor([[ 6.,  0.],
+                [ 0., 12.]])
+    """
+    slope = torch.autograd.grad(kl, params, create_graph=True, materialize_grads=True)
+
+    def product(vectors: Tensor) -> Tensor:
+        return torch.stack([flatten(_pull(slope, params, unflatten(v, params))) for v in vectors])
+
+    return product
+
+
+def gauss_newton_product(
+    statistics: Statistics, statistics_kl: StatisticsKL, params: Sequence[Tensor]
+) -> Product:
+    """Products ``J' F J v``: the Hessian of ``statistics_kl(old, new)`` in ``params`` at new = old.
+
+    ``J`` is the Jacobian of the statistics and ``F`` the Hessian of the KL in them. As the KL has no
+    gradient at ``new = old``, this is the whole Hessian. Both ``J`` and ``F`` are linearised here,
+    once: a product differentiates ``J'u`` in ``u``, which costs a forward-mode pass, and pulls the
+    result back with one reverse-mode pass; the network is not evaluated again.
+
+    Args:
+        statistics (torch.Tensor or TensorDictBase): any shape, with a graph to ``params``.
+        statistics_kl (callable): the KL of two such statistics, a scalar, the mean over the batch.
+        params (sequence of torch.Tensor): the parameters, n numbers in all.
+
+    Returns:
+        callable: from vectors [k, n] to ``J' F J v`` [k, n].
+
+    Raises:
+        ValueError: when ``statistics`` does not depend on the parameters, or ``statistics_kl`` does
+            not return a scalar that depends on its second argument.
+
+    Examples:
+        >>> x = torch.tensor([1.0, 2.0], requires_grad=True)
+        >>> product = gauss_newton_product(x**2, lambda old, new: 0.5 * (new - old).square().sum(), [x])
+        >>> product(torch.eye(2))
+        tensor([[ 4.,  0.],
+                [ 0., 16.]])
+    """
+    keys, leaves = _leaves(statistics)
+    moving = [leaf for leaf in leaves if leaf.requires_grad]
+    if not moving:
+        raise ValueError("'statistics' must depend on the optimizer's parameters, it has no graph.")
+    fresh = [leaf.detach().requires_grad_(leaf.requires_grad) for leaf in leaves]
+    new = _rebuild(keys, fresh, statistics)
+    fresh = [leaf for leaf in fresh if leaf.requires_grad]
+    kl = statistics_kl(detach(statistics), new)
+    if kl.shape != () or not kl.requires_grad:
+        raise ValueError(
+            "statistics_kl(old, new) must return a scalar that depends on new, got a tensor of "
+            f"shape {tuple(kl.shape)} with requires_grad={kl.requires_grad}."
+        )
+    slope = torch.autograd.grad(kl, fresh, create_graph=True, materialize_grads=True)
+    cotangent = [torch.zeros_like(leaf, requires_grad=True) for leaf in moving]
+    pulled = torch.autograd.grad(
+        moving, params, cotangent, create_graph=True, materialize_grads=True
+    )
+
+    def product(vectors: Tensor) -> Tensor:
+        rows = []
+        for vector in vectors:
+            tangent = _pull(pulled, cotangent, unflatten(vector, params))
+            force = _pull(slope, fresh, tangent)
+            rows.append(flatten(_pull(moving, params, force)))
+        return torch.stack(rows)
+
+    return product
+
+
+def detach(statistics: Statistics) -> Statistics:
+    """A copy without graph; a copy, because statistics may be views of the parameters."""
+    return statistics.detach().clone()
+
+
+class ConjugateGradient(NamedTuple):
+    """What :func:`conjugate_gradient` found, for k systems of size n."""
+
+    solution: Tensor
+    """Shape [k, n]."""
+    residual: Tensor
+    """``rhs - H solution``, shape [k, n]; not finite where the products were not."""
+    negative: Tensor
+    """Whether a direction of negative curvature was met, bool, shape [k]."""
+
+
+def conjugate_gradient(
+    product: Product, rhs: Tensor, iterations: int, tolerance: float = 1e-10
+) -> ConjugateGradient:
+    """Solves ``H x = rhs`` for k right-hand sides side by side, H symmetric positive definite.
+
+    A system stops moving once its residual fell below ``tolerance`` times its right-hand side, or
+    when the curvature along its direction is not positive. Nothing here waits for the device.
+
+    Args:
+        product (callable): from vectors [k, n] to ``H v`` [k, n].
+        rhs (torch.Tensor): shape [k, n].
+        iterations (int): products at most.
+        tolerance (float): residual norm at which a system counts as solved, relative to ``rhs``.
+
+    Returns:
+        ConjugateGradient: ``solution``, ``residual`` and ``negative``.
+
+    Examples:
+        >>> hessian = torch.diag(torch.tensor([1.0, 2.0]))
+        >>> conjugate_gradient(lambda v: v @ hessian, torch.ones(1, 2), iterations=2).solution
+        tensor([[1.0000, 0.5000]])
+    """
+    # Unit scale, so that squared norms neither underflow nor overflow in single precision.
+    scale = rhs.abs().amax(-1, keepdim=True)
+    scale = torch.where(scale > 0, scale, torch.ones_like(scale))
+    residual = rhs / scale
+    solution, direction = torch.zeros_like(rhs), residual
+    norm = residual.square().sum(-1, keepdim=True)
+    target = tolerance**2 * norm
+    active = norm > target
+    negative = torch.zeros_like(active)
+    eps = torch.finfo(rhs.dtype).eps
+    for _ in range(iterations):
+        curved = product(direction)
+        curvature = (direction * curved).sum(-1, keepdim=True)
+        size = direction.norm(dim=-1, keepdim=True) * curved.norm(dim=-1, keepdim=True)
+        negative |= active & (curvature < -(eps**0.5) * size)
+        active = active & (norm > target) & (curvature > eps * size)
+        length = torch.where(active, norm / curvature, 0.0)
+        solution = solution + length * direction
+        residual = residual - length * curved
+        previous, norm = norm, residual.square().sum(-1, keepdim=True)
+        direction = residual + torch.where(active, norm / previous, 0.0) * direction
+    return ConjugateGradient(solution * scale, residual * scale, negative.squeeze(-1))
+
+
+def _pull(outputs: Sequence[Tensor], inputs: Sequence[Tensor], weights: Sequence[Tensor]) -> list:
+    """Vector-Jacobian product that keeps the graph; zeros where nothing depends on an input."""
+    pairs = [(o, w) for o, w in zip(outputs, weights, strict=True) if o.requires_grad]
+    if not pairs:
+        return [torch.zeros_like(tensor) for tensor in inputs]
+    reached, cotangents = zip(*pairs, strict=True)
+    return list(
+        torch.autograd.grad(reached, inputs, cotangents, retain_graph=True, materialize_grads=True)
+    )
+
+
+def _leaves(statistics: Statistics) -> tuple[list, list[Tensor]]:
+    if isinstance(statistics, Tensor):
+        return [], [statistics]
+    keys = list(statistics.keys(True, True))
+    return keys, [statistics.get(key) for key in keys]
+
+
+def _rebuild(keys: list, leaves: list[Tensor], like: Statistics) -> Statistics:
+    if isinstance(like, Tensor):
+        return leaves[0]
+    return TensorDict(dict(zip(keys, leaves, strict=True)), batch_size=like.batch_size)

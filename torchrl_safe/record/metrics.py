@@ -1,0 +1,313 @@
+"""What a safe agent is judged by: return, cost, constraint violations (CV) and the score.
+
+Every definition lives here once, as a pure function or a sum over an episode, and is that of
+"SafeTAC: Safe Tsallis Actor-Critic Reinforcement Learning for Safer Exploration" (section V), which
+takes it from "TRC: Trust Region Conditional Value at Risk" (Kim and Oh, RA-L 2022): the score of an
+episode is ``R / (1 + CV)``, where CV counts its violating steps.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable, Iterator
+
+import torch
+from tensordict import NestedKey, TensorDict, TensorDictBase
+from torch import Tensor
+from torchrl.envs import EnvBase
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+
+__all__ = [
+    "batch_metrics",
+    "bootstrap_interval",
+    "count_violations",
+    "evaluate",
+    "score",
+    "summarize",
+]
+
+_NUM_RESAMPLES = 2_000
+
+
+def score(episode_return: Tensor, violations: Tensor) -> Tensor:
+    r"""Score of an episode, :math:`\sum_t R_t / (1 + \sum_t CV_t)`.
+
+    A violation divides the return, so a negative return is pulled towards zero by violations:
+    compare scores only together with the CV rate.
+
+    Args:
+        episode_return (Tensor): undiscounted return of each episode, any shape.
+        violations (Tensor): number of violating steps of each episode, same shape.
+
+    Returns:
+        Tensor: one score per episode. Average these; the score of the averages is another number.
+
+    Raises:
+        ValueError: if the shapes differ.
+
+    Examples:
+        >>> import torch
+        >>> score(torch.tensor([8.0, 9.0]), torch.tensor([0, 2]))
+        tensor([8., 3.])
+    """
+    if episode_return.shape != violations.shape:
+        raise ValueError(
+            "episode_return and violations must have the same shape, got "
+            f"{tuple(episode_return.shape)} and {tuple(violations.shape)}."
+        )
+    return episode_return / (1 + violations)
+
+
+def bootstrap_interval(values: Tensor) -> tuple[float, float]:
+    """95 % percentile-bootstrap interval of the mean of independent values.
+
+    The score is skewed (one violation halves it), which the bootstrap follows and a normal
+    interval does not. Resampling uses a generator of its own with a fixed seed: equal values give
+    equal intervals, and the global random state is untouched.
+
+    Args:
+        values (Tensor): shape [N].
+
+    Returns:
+        tuple of float: lower and upper bound; both NaN for fewer than two values, which say
+        nothing about their spread.
+
+    Raises:
+        ValueError: if ``values`` is not one-dimensional.
+
+    Examples:
+        >>> import torch
+        >>> bootstrap_interval(torch.full((10,), 3.0))
+        (3.0, 3.0)
+    """
+    if values.ndim != 1:
+        raise ValueError(f"values must have shape [N], got {tuple(values.shape)}.")
+    if len(values) < 2:
+        return float("nan"), float("nan")
+    generator = torch.Generator().manual_seed(0)
+    rows = torch.randint(len(values), (_NUM_RESAMPLES, len(values)), generator=generator)
+    means = values.detach().cpu().double()[rows].mean(-1)
+    low, high = means.quantile(torch.tensor([0.025, 0.975], dtype=means.dtype)).tolist()
+    return low, high
+
+
+def evaluate(
+    env: EnvBase,
+    policy: Callable[[TensorDictBase], TensorDictBase],
+    *,
+    num_steps: int = 1_000,
+    exploration_type: ExplorationType,
+    seed: int | None = None,
+) -> TensorDict:
+    r"""Plays one episode in every environment of a batch and measures each of them.
+
+    All environments step together and only running sums are kept, never the rollout. An
+    environment stops counting at its first ``done``, terminated or truncated; it goes on stepping
+    (reset) until the last one is done or ``num_steps`` is reached.
+
+    Pass an environment made for evaluation, never the collector's: the reset here would cut the
+    episodes the collector is in the middle of without it noticing; training episodes may be
+    shorter or start staggered; and training transforms (reward scaling, running normalisation)
+    would enter the score. Global random state is left as found, so training does not depend on
+    when one evaluates.
+
+    Args:
+        env (EnvBase): batch size [\*N], with leaves of shape [\*N, 1] ``("next", "reward")``,
+            ``("next", "cost")``, ``("next", "violation")`` and ``("next", "goal_met")``.
+        policy (callable): from tensordict to tensordict with the action. Put a policy with
+            dropout or the like in ``eval()`` mode first.
+
+    Keyword Args:
+        num_steps (int): most steps per episode. Defaults to 1,000, the paper's episode.
+        exploration_type (ExplorationType): ``RANDOM`` samples the action, ``DETERMINISTIC`` does
+            not. The two differ for a stochastic policy: report both.
+        seed (int, optional): seed of the environments and of the sampled actions. Equal seeds
+            give equal layouts, which makes policies comparable.
+
+    Returns:
+        TensorDict: batch size [\*N], float64, per episode: ``episode_return``, ``violations``
+        (steps), ``cv_rate`` and ``cost_rate`` (per step taken), ``score``, ``goals`` (steps that
+        met one), ``length`` (steps).
+
+    Raises:
+        ValueError: if ``num_steps`` is not positive, or a leaf has another shape.
+        KeyError: if the environment does not write one of the leaves.
+
+    Examples:
+        >>> from torchrl.envs.utils import ExplorationType
+        >>> from torchrl_safe.envs import SafeGoalEnv
+        >>> env = SafeGoalEnv("point", num_envs=2, num_threads=1)
+        >>> episodes = evaluate(
+        ...     env, env.rand_action, num_steps=5, exploration_type=ExplorationType.RANDOM, seed=0
+        ... )
+        >>> episodes["length"].tolist()
+        [5.0, 5.0]
+        >>> summarize(episodes)["eval/length"]
+        5.0
+    """
+    if num_steps < 1:
+        raise ValueError(f"num_steps must be at least 1, got {num_steps}.")
+    names = ("reward", "cost", "violation", "goal_met", "length")
+    zero = torch.zeros(env.batch_size, dtype=torch.float64, device=env.device)
+    total = {name: zero.clone() for name in names}
+    running = torch.ones(env.batch_size, dtype=torch.bool, device=env.device)
+    with acting(exploration_type):
+        if seed is not None:
+            env.set_seed(seed)
+            # An environment may seed more than itself, or less: the policy's noise starts here.
+            torch.manual_seed(seed)
+        td = env.reset()
+        for _ in range(num_steps):
+            stepped, td = env.step_and_maybe_reset(policy(td))
+            for name in ("reward", "cost", "violation", "goal_met"):
+                total[name] += _signal(stepped, ("next", name)).double().where(running, 0.0)
+            total["length"] += running
+            running = running & ~_signal(stepped, ("next", "done"))
+            if not running.any():
+                break
+    return TensorDict(
+        {
+            "episode_return": total["reward"],
+            "violations": total["violation"],
+            "cv_rate": total["violation"] / total["length"],
+            "score": score(total["reward"], total["violation"]),
+            "cost_rate": total["cost"] / total["length"],
+            "goals": total["goal_met"],
+            "length": total["length"],
+        },
+        batch_size=env.batch_size,
+    )
+
+
+def summarize(episodes: TensorDictBase, prefix: str = "eval/") -> dict[str, float]:
+    """Means over episodes, flat and ready for ``logger.log_metrics``.
+
+    Args:
+        episodes (TensorDictBase): what :func:`evaluate` returned, any batch size.
+        prefix (str): put before every name. Defaults to ``"eval/"``.
+
+    Returns:
+        dict of float: ``return``, ``violations``, ``cv_rate``, ``score``, ``cost_rate``,
+        ``goals``, ``length`` and the 95 % interval ``score_low``, ``score_high`` of the score.
+
+    Raises:
+        ValueError: if there is no episode.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> episodes = TensorDict({"score": torch.tensor([2.0, 2.0])}, batch_size=[2])
+        >>> summarize(episodes, "eval/det/")
+        {'eval/det/score': 2.0, 'eval/det/score_low': 2.0, 'eval/det/score_high': 2.0}
+    """
+    if not episodes.batch_size.numel():
+        raise ValueError(f"episodes must hold at least one, got batch {episodes.batch_size}.")
+    metrics = {
+        prefix + name.removeprefix("episode_"): value.double().mean().item()
+        for name, value in episodes.items()
+    }
+    low, high = bootstrap_interval(episodes["score"].flatten())
+    return {**metrics, f"{prefix}score_low": low, f"{prefix}score_high": high}
+
+
+def count_violations(td: TensorDictBase) -> int:
+    """Violating steps in a collector's batch, to be added to a running total of the training run.
+
+    The total belongs to the caller, who saves it with the rest of a checkpoint.
+
+    Args:
+        td (TensorDictBase): a batch with ``("next", "violation")``, e.g. batch size [N, T].
+
+    Returns:
+        int: the number of violating steps.
+
+    Raises:
+        KeyError: if the leaf is missing.
+        ValueError: if its shape is not the batch size and a trailing 1.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> violation = torch.tensor([[True], [False], [True]])
+        >>> total_cvs = 40
+        >>> batch = TensorDict({"next": {"violation": violation}}, batch_size=[3])
+        >>> total_cvs += count_violations(batch)
+        >>> total_cvs
+        42
+    """
+    return int(_signal(td, ("next", "violation")).sum())
+
+
+def batch_metrics(td: TensorDictBase, prefix: str = "train/") -> dict[str, float]:
+    """Means over the steps of a collector's batch, whatever episodes they belong to.
+
+    Args:
+        td (TensorDictBase): a batch with ``("next", "reward")``, ``("next", "cost")`` and
+            ``("next", "violation")``, e.g. batch size [N, T].
+        prefix (str): put before every name. Defaults to ``"train/"``.
+
+    Returns:
+        dict of float: ``reward_per_1000`` (reward per 1,000 steps, comparable with an episode's
+        return), ``cost_rate`` and ``cv_rate`` (per step).
+
+    Raises:
+        KeyError: if a leaf is missing.
+        ValueError: if a leaf's shape is not the batch size and a trailing 1, or the batch is empty.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> step = {"reward": torch.tensor([[0.25], [0.75]]), "cost": torch.tensor([[0.0], [1.0]])}
+        >>> step["violation"] = torch.tensor([[False], [True]])
+        >>> batch_metrics(TensorDict({"next": step}, batch_size=[2]))
+        {'train/reward_per_1000': 500.0, 'train/cost_rate': 0.5, 'train/cv_rate': 0.5}
+    """
+    if not td.batch_size.numel():
+        raise ValueError(f"td must hold at least one step, got batch size {tuple(td.batch_size)}.")
+    means = [
+        _signal(td, ("next", name)).double().mean() for name in ("reward", "cost", "violation")
+    ]
+    reward, cost, violation = torch.stack(means).tolist()
+    return {
+        f"{prefix}reward_per_1000": 1_000 * reward,
+        f"{prefix}cost_rate": cost,
+        f"{prefix}cv_rate": violation,
+    }
+
+
+@contextlib.contextmanager
+def acting(exploration_type: ExplorationType) -> Iterator[None]:
+    """No gradients, the given exploration type, and the global random state put back at the end.
+
+    Args:
+        exploration_type (ExplorationType): how a stochastic policy picks its action.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl.envs.utils import ExplorationType
+        >>> before = torch.get_rng_state()
+        >>> with acting(ExplorationType.RANDOM):
+        ...     noise = torch.randn(3)
+        >>> torch.equal(before, torch.get_rng_state())
+        True
+    """
+    devices = [torch.cuda.current_device()] if torch.cuda.is_initialized() else []
+    with (
+        torch.no_grad(),
+        set_exploration_type(exploration_type),
+        torch.random.fork_rng(devices=devices),
+    ):
+        yield
+
+
+def _signal(td: TensorDictBase, key: NestedKey) -> Tensor:
+    """The leaf ``key`` of shape [*B, 1] as [*B]."""
+    value = td.get(key, None)
+    if value is None:
+        raise KeyError(f"{key} is missing; the tensordict has {sorted(map(str, td.keys(True)))}.")
+    if value.shape != (*td.batch_size, 1):
+        raise ValueError(
+            f"{key} must have shape {(*td.batch_size, 1)} (batch size and a trailing 1), "
+            f"got {tuple(value.shape)}."
+        )
+    return value.squeeze(-1)

@@ -1,0 +1,118 @@
+"""A video of a policy at work."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from collections.abc import Callable
+from contextlib import closing
+from pathlib import Path
+
+import imageio.v2 as imageio
+import numpy as np
+from tensordict import TensorDictBase
+from torchrl.envs import EnvBase
+from torchrl.envs.utils import ExplorationType
+
+from torchrl_safe.record.metrics import acting
+
+__all__ = ["record_video"]
+
+
+def record_video(
+    env: EnvBase,
+    policy: Callable[[TensorDictBase], TensorDictBase],
+    path: str | os.PathLike[str],
+    *,
+    num_steps: int = 1_000,
+    every: int = 2,
+    fps: float = 25,
+    width: int = 480,
+    height: int = 360,
+    index: int = 0,
+    exploration_type: ExplorationType = ExplorationType.DETERMINISTIC,
+) -> Path:
+    """Plays one episode and writes it as an mp4 (H.264, yuv420p) that browsers play.
+
+    The file appears whole or not at all. Pass an environment made for this, never the
+    collector's (see :func:`~torchrl_safe.record.evaluate`), best with a batch of one: all
+    environments of a batch step, one is filmed. The video ends with that one's episode.
+
+    Args:
+        env (EnvBase): with ``render(index=..., width=..., height=...)`` that returns a uint8
+            array [height, width, 3].
+        policy (callable): from tensordict to tensordict with the action.
+        path (path): the ``.mp4`` to write. Missing parent directories are made.
+
+    Keyword Args:
+        num_steps (int): most steps to play. Defaults to 1,000.
+        every (int): film the state before every ``every``-th step. Defaults to 2.
+        fps (float): frames per second of playback; ``1 / (every * seconds per step)`` is real
+            time. Defaults to 25, real time for steps of 0.02 s.
+        width (int): pixels, even. Defaults to 480.
+        height (int): pixels, even. Defaults to 360.
+        index (int): the environment to film. Defaults to 0.
+        exploration_type (ExplorationType): how the policy picks its action. Defaults to
+            ``DETERMINISTIC``.
+
+    Returns:
+        Path: the video.
+
+    Raises:
+        ValueError: if an argument is out of range, before the environment is touched.
+        RuntimeError: if the environment cannot render here, for example without OpenGL.
+
+    Examples:
+        >>> from torchrl_safe.envs import SafeGoalEnv
+        >>> env = SafeGoalEnv("point", num_envs=1, num_threads=1)
+        >>> # Needs OpenGL, so it is not run as a test.
+        >>> record_video(env, env.rand_action, "point.mp4")  # doctest: +SKIP
+        PosixPath('point.mp4')
+    """
+    path = Path(path)
+    if path.suffix != ".mp4":
+        raise ValueError(f"path must end in .mp4, got {str(path)!r}.")
+    for name, value in (("num_steps", num_steps), ("every", every), ("fps", fps)):
+        if not value > 0:
+            raise ValueError(f"{name} must be positive, got {value}.")
+    for name, value in (("width", width), ("height", height)):
+        if value < 2 or value % 2:
+            raise ValueError(f"{name} must be a positive even number (yuv420p), got {value}.")
+    if not 0 <= index < env.batch_size.numel():
+        raise ValueError(f"index must be in [0, {env.batch_size.numel()}), got {index}.")
+
+    def frame() -> np.ndarray:
+        try:
+            image = env.render(index=index, width=width, height=height)
+            if image.shape != (height, width, 3) or image.dtype != np.uint8:
+                raise ValueError(f"got {image.dtype} {image.shape}, not uint8 [height, width, 3]")
+            return image
+        except Exception as error:
+            raise RuntimeError(
+                f"the environment could not render ({type(error).__name__}: {error}); without a "
+                "display, MUJOCO_GL=egl or MUJOCO_GL=osmesa renders off screen where installed."
+            ) from error
+
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(dir=path.parent, prefix=".video-") as folder:
+        whole = Path(folder, path.name)
+        # macro_block_size: even sizes are kept as they are; faststart: plays while it loads.
+        writer = imageio.get_writer(
+            whole,
+            format="FFMPEG",
+            fps=fps,
+            codec="libx264",
+            pixelformat="yuv420p",
+            macro_block_size=2,
+            output_params=["-movflags", "+faststart"],
+        )
+        with acting(exploration_type), closing(writer):
+            td = env.reset()
+            for step in range(num_steps):
+                if step % every == 0:
+                    writer.append_data(frame())
+                stepped, td = env.step_and_maybe_reset(policy(td))
+                if stepped["next", "done"].flatten()[index]:
+                    break
+        os.replace(whole, path)
+    return path

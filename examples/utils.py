@@ -1,0 +1,219 @@
+"""What the example scripts share: networks and a run folder."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+import torch
+from omegaconf import DictConfig, OmegaConf
+from tensordict import TensorDictBase
+from torch import nn
+from torchrl.checkpoint import Checkpoint, CheckpointRotation, GlobalRNGState
+from torchrl.envs import EnvBase
+from torchrl.envs.utils import ExplorationType
+from torchrl.modules import MLP, ValueOperator
+from torchrl.record.loggers import get_logger
+
+from torchrl_safe import GMMTanhPolicy
+from torchrl_safe.record import (
+    evaluate,
+    format_table,
+    plot_learning_curves,
+    record_video,
+    summarize,
+)
+
+# Evaluation layouts are the same for every run, and never those of training (seeded by cfg.seed).
+EVAL_SEED = 1_000_003
+
+
+def make_policy(cfg: DictConfig, env: EnvBase) -> GMMTanhPolicy:
+    """The mixture policy (11)."""
+    action_dim = env.action_spec.shape[-1]
+    network = MLP(
+        env.observation_spec["observation"].shape[-1],
+        cfg.policy.num_components * (1 + 2 * action_dim),
+        num_cells=list(cfg.policy.num_cells),
+        activation_class=nn.ReLU,
+    )
+    return GMMTanhPolicy(
+        network,
+        env.action_spec,
+        num_components=cfg.policy.num_components,
+        relaxation=cfg.policy.relaxation,
+        temperature=cfg.policy.temperature,
+    )
+
+
+def make_critic(cfg: DictConfig, env: EnvBase, out_key: str, *last: nn.Module) -> ValueOperator:
+    """A critic of observation and action; ``last`` is put behind its linear output."""
+    network = MLP(
+        env.observation_spec["observation"].shape[-1] + env.action_spec.shape[-1],
+        1,
+        num_cells=list(cfg.critic.num_cells),
+        activation_class=nn.ReLU,
+    )
+    network.extend(last)
+    return ValueOperator(network, in_keys=["observation", "action"], out_keys=[out_key])
+
+
+class Counters(dict):
+    """Plain numbers of a run that a checkpoint keeps."""
+
+    def state_dict(self) -> dict[str, Any]:
+        """The numbers."""
+        return dict(self)
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Put numbers back."""
+        self.update(state)
+
+
+class Run:
+    """A run's folder: resolved config, log, checkpoints, learning curves, results and video.
+
+    Args:
+        cfg (DictConfig): the run's configuration.
+        **components: what a checkpoint keeps, besides counters and random state.
+
+    Raises:
+        FileExistsError: if the folder holds a run and ``cfg.resume`` is not set.
+        FileNotFoundError: if there is nothing to resume.
+    """
+
+    def __init__(self, cfg: DictConfig, **components: Any) -> None:
+        self.cfg = cfg
+        self.path = Path(cfg.run_dir)
+        self.counters = Counters(frames=0, total_cvs=0, seconds=0.0)
+        self.checkpoint = Checkpoint(counters=self.counters, random=GlobalRNGState(), **components)
+        self.rotation = CheckpointRotation(
+            self.path / "checkpoints", keep_last=cfg.checkpoint.keep_last
+        )
+        if cfg.resume:
+            self.rotation.load_latest(self.checkpoint)
+        elif (self.path / "config.yaml").exists():
+            raise FileExistsError(
+                f"run_dir={cfg.run_dir} holds a run already: add resume=true to go on with it, or "
+                "choose another run_dir."
+            )
+        self.path.mkdir(parents=True, exist_ok=True)
+        OmegaConf.save(cfg, self.path / "config.yaml", resolve=True)
+        os.environ.setdefault("WANDB_MODE", "offline")
+        self.logger = get_logger(
+            cfg.logger.backend,
+            logger_name=str(self.path),
+            experiment_name="log",
+            wandb_kwargs={"project": cfg.logger.project_name, "dir": str(self.path)},
+        )
+
+    @property
+    def frames(self) -> int:
+        """Frames collected so far."""
+        return self.counters["frames"]
+
+    def log(self, metrics: Mapping[str, float]) -> None:
+        """Write metrics at the current frame."""
+        if self.logger is not None:
+            self.logger.log_metrics(dict(metrics), step=self.frames)
+
+    def save(self) -> None:
+        """Write a checkpoint; a crash while writing leaves the last one whole."""
+        self.rotation.save(self.checkpoint, step=self.frames)
+
+    def evaluate(
+        self, env: EnvBase, policy: Callable[[TensorDictBase], TensorDictBase]
+    ) -> dict[str, float]:
+        """One episode in every environment, with sampled and with deterministic actions."""
+        metrics = {}
+        for prefix, kind in (
+            ("eval/", ExplorationType.RANDOM),
+            ("eval/det/", ExplorationType.DETERMINISTIC),
+        ):
+            episodes = evaluate(
+                env,
+                policy,
+                num_steps=self.cfg.eval.num_steps,
+                exploration_type=kind,
+                seed=EVAL_SEED,
+            )
+            metrics |= summarize(episodes, prefix)
+        return metrics
+
+    def plot(self) -> None:
+        """Draw the learning curves; they need the csv log."""
+        if self.cfg.logger.backend == "csv":
+            plot_learning_curves(
+                self.path / "log", self.path / "curves.png", cost_limit=self.cfg.loss.cost_limit
+            )
+
+    def finish(self, env: EnvBase, policy: Callable[[TensorDictBase], TensorDictBase]) -> None:
+        """Final evaluation, table, curves and video."""
+        metrics = self.evaluate(env, policy)
+        self.log({f"final/{key.removeprefix('eval/')}": value for key, value in metrics.items()})
+        frames, seconds = self.counters["frames"], self.counters["seconds"]
+        results = {
+            **metrics,
+            "total_cvs": self.counters["total_cvs"],
+            "frames": frames,
+            "seconds": seconds,
+            "frames_per_second": frames / seconds if seconds else 0.0,
+        }
+        (self.path / "results.json").write_text(json.dumps(results, indent=2) + "\n")
+        self.plot()
+        rows = {
+            f"score, deterministic ({env.batch_size.numel()} episodes)": metrics["eval/det/score"],
+            "score, sampled": metrics["eval/score"],
+            "return, deterministic": metrics["eval/det/return"],
+            "CV per step, deterministic": metrics["eval/det/cv_rate"],
+            "CV per step, sampled": metrics["eval/cv_rate"],
+            "total CVs in training": str(self.counters["total_cvs"]),
+            "frames": str(frames),
+            "frames/s": results["frames_per_second"],
+        }
+        print(format_table(rows))
+        if self.cfg.video.num_steps:
+            try:
+                path = record_video(
+                    env, policy, self.path / "video.mp4", num_steps=self.cfg.video.num_steps
+                )
+                print(f"video: {path}")
+            except RuntimeError as error:
+                print(f"no video: {error}")
+        print(f"results: {self.path}")
+
+
+class GracefulStop:
+    """Turns the first Ctrl-C (or SIGTERM) into a flag, so that a run stops between two updates.
+
+    A second one interrupts at once.
+    """
+
+    def __init__(self) -> None:
+        self.requested = False
+        self._previous: dict[signal.Signals, Any] = {}
+
+    def __enter__(self) -> GracefulStop:
+        for number in (signal.SIGINT, signal.SIGTERM):
+            self._previous[number] = signal.signal(number, self._stop)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for number, handler in self._previous.items():
+            signal.signal(number, handler)
+
+    def _stop(self, number: int, frame: FrameType | None) -> None:
+        if self.requested:
+            raise KeyboardInterrupt
+        self.requested = True
+
+
+def use_threads(count: int) -> None:
+    """Bound torch's threads, unless the environment says otherwise."""
+    if "OMP_NUM_THREADS" not in os.environ:
+        torch.set_num_threads(count)

@@ -129,7 +129,7 @@ class SafeGoalEnv(EnvBase):
         return self._to_tensordict(frame, {})
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
-        if "_step" in tensordict.keys():  # noqa: SIM118 (a tensordict is no dict)
+        if "_step" in tensordict.keys():
             raise NotImplementedError("SafeGoalEnv steps all of its environments at once.")
         action = tensordict.get("action").detach().cpu().numpy()
         frame = self._core.step(action)

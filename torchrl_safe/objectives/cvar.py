@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, Literal
@@ -150,7 +151,6 @@ class CVaRCostLoss(LossModule):
     default_keys = _AcceptedKeys
     tensor_keys: _AcceptedKeys
     default_value_estimator = RetraceEstimator
-    out_keys = ["loss_cost_value", "loss_cost_std", "cost_value", "cost_std"]
 
     SUPPORTED_VALUE_ESTIMATORS = (ValueEstimators.TD0, ValueEstimators.TDLambda)
 
@@ -192,6 +192,7 @@ class CVaRCostLoss(LossModule):
             )
         self._in_keys: list[NestedKey] | None = None
         super().__init__()
+        self.out_keys = ["loss_cost_value", "loss_cost_std", "cost_value", "cost_std"]
         self.use_prioritized_weights = use_prioritized_weights
         self.convert_to_functional(actor_network, "actor_network", create_target_params=False)
         self.delay_cost = delay_cost
@@ -209,7 +210,7 @@ class CVaRCostLoss(LossModule):
         self.loss_function = loss_function
         self.reduction = reduction
         self.deactivate_vmap = deactivate_vmap
-        self._variance_estimator: ValueEstimatorBase | None = None
+        self._variance_estimator: Any = None
         self._make_vmap()
 
     def _make_vmap(self) -> None:
@@ -254,7 +255,9 @@ class CVaRCostLoss(LossModule):
                     f"value_type {value_type} is not supported; use one of {supported} or an "
                     "estimator class."
                 )
-            build = partial(build_value_estimator, self, value_type)
+            build: Callable[..., ValueEstimatorBase] = partial(
+                build_value_estimator, self, value_type
+            )
         else:
             build = value_type
         self._value_estimator, self._variance_estimator = (

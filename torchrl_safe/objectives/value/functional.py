@@ -189,8 +189,9 @@ def squared_td_error(
 ) -> Tensor:
     r"""Reward of the variance recursion with the noise of its mean removed.
 
-    With :math:`\delta = c_t + \gamma (1 - term_t) Q_C(s_{t+1}, a'_{t+1}) - Q_C(s_t, a_t)`, the reward
-    of :func:`retrace_variance_reward` is :math:`\delta^2 + 2 Q_C(s_t, a_t) \delta`. Where
+    With the TD error
+    :math:`\delta = c_t + \gamma (1 - term_t) Q_C(s_{t+1}, a'_{t+1}) - Q_C(s_t, a_t)`, the reward of
+    :func:`retrace_variance_reward` is :math:`\delta^2 + 2 Q_C(s_t, a_t) \delta`. Where
     :math:`Q_C` solves its Bellman equation, :math:`\delta` has mean zero, so that
     :math:`\delta^2` alone has the same mean; it is never negative, and it lacks the term that
     grows with :math:`Q_C` and drowns the variance (Sherstan et al. 2018,

@@ -46,9 +46,11 @@ def policy_closure(
     reward_loss: TsallisLoss,
     cost_loss: CVaRCostLoss,
     states: TensorDictBase,
+    level: torch.Tensor,
 ) -> Callable[[], TensorDict]:
     """Objective, constraint and policy moments of (13) as a function of the policy's weights.
 
+    ``level`` is the CVaR that the policy of now is known to have; the critics say how it changes.
     The noise of the actions is drawn here, once: the line search then compares policies, not draws.
     """
     with torch.no_grad():
@@ -63,7 +65,9 @@ def policy_closure(
         return TensorDict(
             {
                 "objective": reward_loss.objective(states, action, log_prob).mean(),
-                "constraint": cost_loss.constraint(states, action, reference=reference)[None],
+                "constraint": cost_loss.constraint(
+                    states, action, reference=reference, level=level
+                )[None],
                 "statistics": {"mean": mean, "cov": cov},
             }
         )
@@ -188,7 +192,9 @@ def main(cfg: DictConfig) -> None:
         for batch in collector:
             run.counters["frames"] += batch.numel()
             run.counters["total_cvs"] += count_violations(batch)
-            metrics = batch_metrics(batch) | {"train/total_cvs": run.counters["total_cvs"]}
+            metrics = batch_metrics(batch)
+            metrics["train/total_cvs"] = run.counters["total_cvs"]
+            metrics["train/entropy"] = -batch["action_log_prob"].mean().item()
             buffer.extend(batch.select(*REPLAYED))
 
             if run.frames >= cfg.collector.init_frames:
@@ -209,12 +215,11 @@ def main(cfg: DictConfig) -> None:
                             critic_optim.step()
                             critic_optim.zero_grad()
                 with timeit("time/policy"):
-                    replayed = data[torch.randperm(data.numel())[: cfg.optim.policy_frames]]
-                    states = torch.cat(
-                        [part.select("observation").flatten() for part in (batch, replayed)]
-                    )
+                    visited = batch.select("observation").flatten()
+                    states = visited[torch.randperm(len(visited))[: cfg.optim.policy_frames]]
+                    level = cost_loss.on_policy_cvar(batch)
                     report = policy_optim.step(
-                        policy_closure(policy, reward_loss, cost_loss, states)
+                        policy_closure(policy, reward_loss, cost_loss, states, level)
                     )
                 metrics |= report.to_dict()
                 metrics |= {f"update/{name}": value.item() for name, value in losses.items()}

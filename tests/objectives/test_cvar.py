@@ -198,7 +198,7 @@ class TestCritics:
         gamma = 0.9
         loss = make_loss(gamma=gamma, lmbda=0.9, variance_reward=variance_reward)
         optim = torch.optim.Adam(loss.parameters(), lr=1e-2)
-        for step in range(600):
+        for step in range(300):
             data = make_data((32, 10))
             data["observation"].zero_()
             data["next", "observation"].zero_()
@@ -212,7 +212,7 @@ class TestCritics:
             (out["loss_cost_value"] + out["loss_cost_std"]).backward()
             optim.step()
             for group in optim.param_groups:
-                group["lr"] = 1e-2 * (1 - step / 600)
+                group["lr"] = 1e-2 * (1 - step / 300)
         assert out["cost_value"].item() == pytest.approx(0.5 / (1 - gamma), rel=0.03)
         exact = 0.2 / math.sqrt(1 - gamma**2)
         assert low * exact < out["cost_std"].item() < high * exact
@@ -318,6 +318,32 @@ class TestConstraint:
         (scaled_grad,) = torch.autograd.grad(scaled, action)
         torch.testing.assert_close(scaled, plain)
         torch.testing.assert_close(scaled_grad, 10 * plain_grad)
+
+    def test_level(self):
+        loss, data = make_loss(cost_limit=1.5, gamma=0.9, risk_level=0.5), make_data()
+        _, std = predictions(loss, data, data["action"])
+        mean_cost = data["next", "cost"].mean()
+        level = loss.on_policy_cvar(data)
+        assert not level.requires_grad
+        expected = mean_cost * 10 + 0.79788456 * std.mean().detach()
+        torch.testing.assert_close(level, expected, rtol=1e-6, atol=1e-6)
+        reference = loss.cvar(data, data["action"]).mean()
+        actual = loss.constraint(data, data["action"], reference=reference, level=level)
+        torch.testing.assert_close(actual, level - 1.5)
+        with pytest.raises(ValueError, match="needs the reference"):
+            loss.constraint(data, data["action"], level=level)
+
+    def test_mean_of_the_critic_over_visited_states(self):
+        """A two-state chain that costs 1 in one state and 0 in the other, solved exactly."""
+        gamma = 0.9
+        transition = torch.tensor([[0.8, 0.2], [0.6, 0.4]], dtype=torch.float64)
+        cost = torch.tensor([0.0, 1.0], dtype=torch.float64)
+        value = torch.linalg.solve(torch.eye(2).double() - gamma * transition, cost)
+        visited = torch.tensor(
+            [0.75, 0.25], dtype=torch.float64
+        )  # stationary: visited @ T = visited
+        torch.testing.assert_close(visited @ transition, visited)
+        torch.testing.assert_close(visited @ value, visited @ cost / (1 - gamma))
 
     def test_units_agree(self):
         """In a chain that costs c at each step, constraint and limit are both c / (1 - gamma).

@@ -430,8 +430,37 @@ class CVaRCostLoss(LossModule):
         )
         return gaussian_cvar(mean.mean(0), std.mean(0), self.risk_level)
 
+    def on_policy_cvar(self, tensordict: TensorDictBase) -> Tensor:
+        r"""Mean CVaR of the policy that took the given steps, from the costs it really met.
+
+        Over the states that a policy visits, the mean of its ``Q_C`` is its mean cost per step
+        over ``1 - gamma``. Measured like this, the level follows the policy at once, where the
+        critic has to learn it; the standard deviation is the critic's.
+
+        Args:
+            tensordict (TensorDictBase): steps of the current policy, ``[*B]``.
+
+        Returns:
+            The mean CVaR, a scalar without gradient, in units of the discounted cost sum.
+        """
+        keys = self.tensor_keys
+        with torch.no_grad():
+            _, std = self._predict(
+                tensordict,
+                tensordict.get(keys.action),
+                self.cost_network_params,
+                self.std_network_params,
+            )
+            mean = tensordict.get(_next(keys.cost)).mean() / (1 - self.value_estimator.gamma)
+            return gaussian_cvar(mean, std.mean(), self.risk_level)
+
     def constraint(
-        self, tensordict: TensorDictBase, action: Tensor, *, reference: Tensor | None = None
+        self,
+        tensordict: TensorDictBase,
+        action: Tensor,
+        *,
+        reference: Tensor | None = None,
+        level: Tensor | None = None,
     ) -> Tensor:
         r"""The constraint (8), ``E[Gamma] - cost_limit``, feasible at or below 0.
 
@@ -443,8 +472,7 @@ class CVaRCostLoss(LossModule):
 
         .. math::
 
-            \Gamma_\text{reference}
-            + \frac{E[\Gamma] - \Gamma_\text{reference}}{1 - \gamma} - d
+            \text{level} + \frac{E[\Gamma] - \text{reference}}{1 - \gamma} - d
 
         Args:
             tensordict (TensorDictBase): holds the critics' inputs but the action, ``[*B]``.
@@ -452,13 +480,21 @@ class CVaRCostLoss(LossModule):
 
         Keyword Args:
             reference (Tensor, optional): scalar. Without it, the constraint is (8) as written.
+            level (Tensor, optional): CVaR of the policy before its change, a scalar, such as
+                :meth:`on_policy_cvar`. Defaults to ``reference``.
 
         Returns:
             The constraint, a scalar, in units of the discounted cost sum.
+
+        Raises:
+            ValueError: if there is a ``level`` and no ``reference``.
         """
         value = self.cvar(tensordict, action).mean()
         if reference is not None:
-            value = reference + (value - reference) / (1 - self.value_estimator.gamma)
+            change = (value - reference) / (1 - self.value_estimator.gamma)
+            value = (reference if level is None else level) + change
+        elif level is not None:
+            raise ValueError(f"level={level} needs the reference that it takes the place of.")
         return value - self.cost_limit
 
     def _predict(

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
-Statistics = Tensor | TensorDictBase
-StatisticsKL = Callable[[Statistics, Statistics], Tensor]
-Product = Callable[[Tensor], Tensor]
+Statistics: TypeAlias = Tensor | TensorDictBase
+StatisticsKL: TypeAlias = Callable[[Statistics, Statistics], Tensor]
+Product: TypeAlias = Callable[[Tensor], Tensor]
 
 
 def flatten(tensors: Sequence[Tensor]) -> Tensor:
@@ -25,6 +25,52 @@ def unflatten(vector: Tensor, like: Sequence[Tensor]) -> list[Tensor]:
     return [chunk.view(tensor.shape) for chunk, tensor in zip(chunks, like, strict=True)]
 
 
+def gradient(
+    name: str,
+    outputs: Sequence[Tensor],
+    params: Sequence[Tensor],
+    cotangents: Sequence[Tensor] | None = None,
+    *,
+    create_graph: bool = False,
+) -> list[Tensor]:
+    """Gradients that keep the graph: zero where a parameter does not matter, an error if none does.
+
+    Args:
+        name (str): of the outputs, for the error.
+        outputs (sequence of torch.Tensor): scalars, unless there are ``cotangents``.
+        params (sequence of torch.Tensor): the parameters.
+        cotangents (sequence of torch.Tensor, optional): weights, each shaped as its output.
+
+    Keyword Args:
+        create_graph (bool): whether the gradients can be differentiated. Defaults to ``False``.
+
+    Returns:
+        list of torch.Tensor: shaped as the parameters.
+
+    Raises:
+        ValueError: when the outputs depend on no parameter.
+
+    Examples:
+        >>> x, y = (torch.ones(2, requires_grad=True) for _ in range(2))
+        >>> gradient("objective", [(3 * x).sum()], [x, y])
+        [tensor([3., 3.]), tensor([0., 0.])]
+    """
+    grads: tuple[Tensor | None, ...] = ()
+    if any(output.requires_grad for output in outputs):
+        grads = torch.autograd.grad(
+            outputs,
+            params,
+            cotangents,
+            retain_graph=True,
+            create_graph=create_graph,
+            allow_unused=True,
+        )
+    if all(grad is None for grad in grads):
+        raise ValueError(f"{name!r} must depend on the optimizer's parameters, it does not.")
+    pairs = zip(grads, params, strict=True)
+    return [torch.zeros_like(param) if grad is None else grad for grad, param in pairs]
+
+
 def hessian_product(kl: Tensor, params: Sequence[Tensor]) -> Product:
     """Products with the Hessian of ``kl``, by double backward.
 
@@ -35,13 +81,16 @@ def hessian_product(kl: Tensor, params: Sequence[Tensor]) -> Product:
     Returns:
         callable: from vectors [k, n] to ``H v`` [k, n].
 
+    Raises:
+        ValueError: when ``kl`` does not depend on the parameters.
+
     Examples:
         >>> x = torch.tensor([1.0, 2.0], requires_grad=True)
         >>> hessian_product((x**3).sum(), [x])(torch.eye(2))
         tensor([[ 6.,  0.],
                 [ 0., 12.]])
     """
-    slope = torch.autograd.grad(kl, params, create_graph=True, materialize_grads=True)
+    slope = gradient("kl", [kl], params, create_graph=True)
 
     def product(vectors: Tensor) -> Tensor:
         return torch.stack([flatten(_pull(slope, params, unflatten(v, params))) for v in vectors])
@@ -54,10 +103,10 @@ def gauss_newton_product(
 ) -> Product:
     """Products ``J' F J v``: the Hessian of ``statistics_kl(old, new)`` in ``params`` at new = old.
 
-    ``J`` is the Jacobian of the statistics and ``F`` the Hessian of the KL in them. As the KL has no
-    gradient at ``new = old``, this is the whole Hessian. Both ``J`` and ``F`` are linearised here,
-    once: a product differentiates ``J'u`` in ``u``, which costs a forward-mode pass, and pulls the
-    result back with one reverse-mode pass; the network is not evaluated again.
+    ``J`` is the Jacobian of the statistics and ``F`` the Hessian of the KL in them. As the KL has
+    no gradient at ``new = old``, this is the whole Hessian. Both are linearised here, once: a
+    product differentiates ``J'u`` in ``u``, which costs a forward-mode pass, and pulls the result
+    back with one reverse-mode pass; the network is not evaluated again.
 
     Args:
         statistics (torch.Tensor or TensorDictBase): any shape, with a graph to ``params``.
@@ -73,15 +122,16 @@ def gauss_newton_product(
 
     Examples:
         >>> x = torch.tensor([1.0, 2.0], requires_grad=True)
-        >>> product = gauss_newton_product(x**2, lambda old, new: 0.5 * (new - old).square().sum(), [x])
-        >>> product(torch.eye(2))
+        >>> def kl(old, new):
+        ...     return 0.5 * (new - old).square().sum()
+        >>> gauss_newton_product(x**2, kl, [x])(torch.eye(2))
         tensor([[ 4.,  0.],
                 [ 0., 16.]])
     """
     keys, leaves = _leaves(statistics)
     moving = [leaf for leaf in leaves if leaf.requires_grad]
-    if not moving:
-        raise ValueError("'statistics' must depend on the optimizer's parameters, it has no graph.")
+    cotangent = [torch.zeros_like(leaf, requires_grad=True) for leaf in moving]
+    pulled = gradient("statistics", moving, params, cotangent, create_graph=True)
     fresh = [leaf.detach().requires_grad_(leaf.requires_grad) for leaf in leaves]
     new = _rebuild(keys, fresh, statistics)
     fresh = [leaf for leaf in fresh if leaf.requires_grad]
@@ -92,10 +142,6 @@ def gauss_newton_product(
             f"shape {tuple(kl.shape)} with requires_grad={kl.requires_grad}."
         )
     slope = torch.autograd.grad(kl, fresh, create_graph=True, materialize_grads=True)
-    cotangent = [torch.zeros_like(leaf, requires_grad=True) for leaf in moving]
-    pulled = torch.autograd.grad(
-        moving, params, cotangent, create_graph=True, materialize_grads=True
-    )
 
     def product(vectors: Tensor) -> Tensor:
         rows = []
@@ -119,7 +165,9 @@ class ConjugateGradient(NamedTuple):
     solution: Tensor
     """Shape [k, n]."""
     residual: Tensor
-    """``rhs - H solution``, shape [k, n]; not finite where the products were not."""
+    """``rhs - H solution``, shape [k, n]."""
+    relative_residual: Tensor
+    """Its norm over that of ``rhs``, shape [k]; not finite where the products were not."""
     negative: Tensor
     """Whether a direction of negative curvature was met, bool, shape [k]."""
 
@@ -139,7 +187,7 @@ def conjugate_gradient(
         tolerance (float): residual norm at which a system counts as solved, relative to ``rhs``.
 
     Returns:
-        ConjugateGradient: ``solution``, ``residual`` and ``negative``.
+        ConjugateGradient: ``solution``, ``residual``, ``relative_residual`` and ``negative``.
 
     Examples:
         >>> hessian = torch.diag(torch.tensor([1.0, 2.0]))
@@ -152,7 +200,7 @@ def conjugate_gradient(
     residual = rhs / scale
     solution, direction = torch.zeros_like(rhs), residual
     norm = residual.square().sum(-1, keepdim=True)
-    target = tolerance**2 * norm
+    start, target = norm.sqrt(), tolerance**2 * norm
     active = norm > target
     negative = torch.zeros_like(active)
     eps = torch.finfo(rhs.dtype).eps
@@ -160,14 +208,18 @@ def conjugate_gradient(
         curved = product(direction)
         curvature = (direction * curved).sum(-1, keepdim=True)
         size = direction.norm(dim=-1, keepdim=True) * curved.norm(dim=-1, keepdim=True)
+        active = active & (norm > target)
         negative |= active & (curvature < -(eps**0.5) * size)
-        active = active & (norm > target) & (curvature > eps * size)
+        active = active & (curvature > eps * size)
         length = torch.where(active, norm / curvature, 0.0)
         solution = solution + length * direction
         residual = residual - length * curved
         previous, norm = norm, residual.square().sum(-1, keepdim=True)
         direction = residual + torch.where(active, norm / previous, 0.0) * direction
-    return ConjugateGradient(solution * scale, residual * scale, negative.squeeze(-1))
+    relative = norm.sqrt() / torch.where(start > 0, start, 1.0)
+    return ConjugateGradient(
+        solution * scale, residual * scale, relative.squeeze(-1), negative.squeeze(-1)
+    )
 
 
 def _pull(outputs: Sequence[Tensor], inputs: Sequence[Tensor], weights: Sequence[Tensor]) -> list:

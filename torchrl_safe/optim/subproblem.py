@@ -56,17 +56,17 @@ def solve_subproblem(
 ) -> Subproblem:
     """Solves the trust-region subproblem from its Gram scalars.
 
-    In units of the region's radius, with ``v_0 .. v_m`` the unit vectors along the gradients in the
-    metric of ``H^-1``, the problem is to maximise ``v_0'y`` over ``|y| <= 1`` and ``v_i'y <= -d_i``,
-    ``d_i = c_i / sqrt(2 max_kl s_ii)``. For a set of active constraints the best point is known in
-    closed form, and the best feasible one over all sets is the optimum. With one constraint the
-    two sets are the two branches of the closed form in the literature.
+    In units of the region's radius, with ``v_0 .. v_m`` the unit vectors along the gradients in
+    the metric of ``H^-1``, the problem is to maximise ``v_0'y`` over ``|y| <= 1`` and
+    ``v_i'y <= -d_i``, ``d_i = c_i / sqrt(2 max_kl s_ii)``. For a set of active constraints the best
+    point is known in closed form, and the best feasible one over all sets is the optimum. With one
+    constraint the two sets are the two branches of the closed form in the literature.
 
     A violation that cannot be removed is shared out as follows. The largest scaled violation
     ``t = max_i (d_i + v_i'y)``, over the violated constraints, is made as small as a step of
     length ``recovery_ratio`` (in radii) can make it, while satisfied constraints keep holding and
-    no violated one grows; the rest of the region then serves the objective, with that reduction kept.
-    With one constraint this caps the violation at ``recovery_ratio * sqrt(2 max_kl s)``, and
+    no violated one grows; the rest of the region then serves the objective, with that reduction
+    kept. With one constraint this caps the violation at ``recovery_ratio * sqrt(2 max_kl s)``, and
     ``recovery_ratio=1`` is the pure recovery step ``-sqrt(2 max_kl / s) H^-1 b``.
 
     Args:
@@ -121,8 +121,7 @@ def solve_subproblem(
 
     distance = distance[kept]
     case = "feasible"
-    violated = distance > 0
-    if violated.any():
+    if distance.max() > _FEASIBILITY:
         cut = _reachable_reduction(faces, distance, recovery_ratio)
         if cut <= _FEASIBILITY:
             return Subproblem("rejected", 0.0, weight, "no direction lowers the largest violation")
@@ -167,7 +166,7 @@ class _Faces:
         return weight, weight @ distance
 
     def _feasible(self, values: Array, distance: Array) -> NDArray[np.bool_]:
-        return (values + distance <= _FEASIBILITY).all(-1)
+        return np.asarray((values + distance <= _FEASIBILITY).all(-1))
 
     def reaches(self, distance: Array, radius: float) -> bool:
         """Whether some point within ``radius`` of the origin satisfies all constraints."""

@@ -1,11 +1,12 @@
-"""A constrained trust-region step for any model: CPO, TRC, TRPO and SafeTAC under one optimizer."""
+"""A constrained trust-region step for any model: TRPO, CPO, TRC and SafeTAC under one optimizer."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from typing import Any
+from numbers import Integral, Real
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 import torch
@@ -14,17 +15,21 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from torchrl_safe.optim.curvature import (
+    Statistics,
     StatisticsKL,
     conjugate_gradient,
     detach,
     flatten,
     gauss_newton_product,
+    gradient,
     hessian_product,
     unflatten,
 )
-from torchrl_safe.optim.subproblem import Subproblem, solve_subproblem
+from torchrl_safe.optim.subproblem import MAX_CONSTRAINTS, solve_subproblem
 
-Closure = Callable[[], TensorDictBase]
+__all__ = ["TrustRegionReport", "TrustRegionSafeOptimizer"]
+
+Closure: TypeAlias = Callable[[], TensorDictBase]
 
 CASES = ("unconstrained", "inert", "feasible", "recoverable", "infeasible", "rejected")
 """Names of the cases of a step; a report's ``case_code`` is the position in this list."""
@@ -46,9 +51,9 @@ class TrustRegionReport:
         objective (float): before the step.
         objective_change (float): what the step did.
         objective_predicted (float): what it should have done.
-        constraint (list of float): before the step, [m].
-        constraint_change (list of float): what the step did, [m].
-        constraint_predicted (list of float): what it should have done, [m].
+        constraint (tuple of float): before the step, [m].
+        constraint_change (tuple of float): what the step did, [m].
+        constraint_predicted (tuple of float): what it should have done, [m].
         cg_residual (float): largest relative residual of the conjugate gradients' systems.
     """
 
@@ -90,6 +95,10 @@ class TrustRegionReport:
         return {prefix + name: value for name, value in numbers.items()}
 
 
+# Of the line search: a share of max_kl, and of the most that one step can lower a constraint by.
+_TOLERANCE = 0.01
+
+
 class _Rejected(Exception):
     """A step that cannot be computed; the message says why."""
 
@@ -104,6 +113,20 @@ class _Evaluation:
 
     def is_finite(self) -> bool:
         return bool(np.isfinite([self.objective, self.kl, *self.constraint]).all())
+
+    def __str__(self) -> str:
+        constraint = f", constraint={self.constraint.tolist()}" if self.constraint.size else ""
+        return f"objective={self.objective}{constraint}, kl={self.kl}"
+
+
+class _Proposal(NamedTuple):
+    """The subproblem's step, and what the line search needs to judge it."""
+
+    case: str
+    direction: Tensor  # [n]
+    predicted: list[float]  # changes of the objective and the constraints, [1 + m]
+    tolerance: NDArray[np.float64]  # excess of a constraint that is let pass, [m]
+    cg_residual: float
 
 
 class TrustRegionSafeOptimizer(torch.optim.Optimizer):
@@ -120,13 +143,17 @@ class TrustRegionSafeOptimizer(torch.optim.Optimizer):
     for the direction ``x``; a line search then shortens it until the true KL is inside the region
     and the true objective and constraints did what a step of its kind must do:
 
-    * the KL is at most ``max_kl``;
-    * a constraint that held still holds, and one that was violated is not violated more;
+    * the KL is at most ``max_kl`` (and at least ``-max_kl``: an estimate below that is none), up
+      to a hundredth of it, since the subproblem's step is as long as the region allows;
+    * a constraint that held still holds, and one that was violated is not violated more, up to a
+      hundredth of what one step can lower it by: along a curved boundary every step violates it a
+      little, and a strict search would be stuck there for good;
     * the objective did not fall, if all constraints held.
 
-    When no candidate does, or anything is not finite, the parameters are put back bit for bit and
-    the report says why. Without constraints this is TRPO (https://arxiv.org/abs/1502.05477), with
-    them CPO (https://arxiv.org/abs/1705.10528): the closure decides.
+    When no candidate does, a number is not finite or the closure raises, the parameters are put
+    back bit for bit. Unless it raised, the report says why. Without constraints this is TRPO
+    (https://arxiv.org/abs/1502.05477), with them CPO (https://arxiv.org/abs/1705.10528): the
+    closure decides.
 
     **The closure** is a deterministic function of the current parameters (draw noise once, before
     the step) that returns a TensorDict without batch size, holding
@@ -141,7 +168,8 @@ class TrustRegionSafeOptimizer(torch.optim.Optimizer):
       linearised once a step.
 
     Args:
-        params (iterable of Parameter): parameters of the policy.
+        params (iterable of Parameter): parameters of the policy, in one group. Those that do not
+            require a gradient when a step starts stay as they are.
 
     Keyword Args:
         max_kl (float): size of the region, in nats. Defaults to 1e-3.
@@ -152,13 +180,16 @@ class TrustRegionSafeOptimizer(torch.optim.Optimizer):
         recovery_ratio (float): share of the region's radius that a violated constraint may claim,
             in (0, 1]; the rest goes to the objective. At 1 a violation that cannot be removed at
             once gives CPO's pure recovery step. Defaults to 1.0.
-        statistics_kl (callable, optional): from old and new statistics to their mean KL, a scalar.
+        statistics_kl (callable, optional): from old and new statistics to their mean KL, a scalar,
+            twice differentiable in the new ones.
 
     ``max_kl``, ``damping``, ``backtrack_ratio``, ``max_backtracks``, ``cg_iters`` and
     ``recovery_ratio`` live in ``param_groups[0]`` and may be scheduled there.
 
     Raises:
-        ValueError: if an argument is out of its range, or the parameters differ in dtype or device.
+        TypeError: if ``statistics_kl`` is not callable.
+        ValueError: if an argument is out of its range, or the parameters are not floating point,
+            differ in dtype or device, or come in several groups.
 
     Examples:
         >>> import torch
@@ -192,6 +223,9 @@ class TrustRegionSafeOptimizer(torch.optim.Optimizer):
         recovery_ratio: float = 1.0,
         statistics_kl: StatisticsKL | None = None,
     ) -> None:
+        if statistics_kl is not None and not callable(statistics_kl):
+            raise TypeError(f"statistics_kl must be callable or None, got {statistics_kl!r}.")
+        self.statistics_kl = statistics_kl
         defaults = {
             "max_kl": max_kl,
             "damping": damping,
@@ -202,17 +236,17 @@ class TrustRegionSafeOptimizer(torch.optim.Optimizer):
         }
         _check_settings(defaults)
         super().__init__(params, defaults)
-        if len(self.param_groups) != 1:
-            raise ValueError(
-                "params must be one group: a trust region has one size, got "
-                f"{len(self.param_groups)} groups."
-            )
-        kinds = {(p.dtype, p.device) for p in self.param_groups[0]["params"]}
-        if len(kinds) != 1:
-            raise ValueError(
-                f"params must share one dtype and device, got {sorted(map(str, kinds))}."
-            )
-        self.statistics_kl = statistics_kl
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**super().__getstate__(), "statistics_kl": self.statistics_kl}
+
+    def add_param_group(self, param_group: dict[str, Any]) -> None:
+        """Take the one group of parameters; a second one is a ``ValueError``."""
+        if self.param_groups:
+            raise ValueError("params must be one group, got several: a trust region has one size.")
+        _check_settings({**self.defaults, **param_group})
+        super().add_param_group(param_group)
+        _check_params(self.param_groups[0]["params"])
 
     def step(self, closure: Closure) -> TrustRegionReport:  # type: ignore[override]
         """Take one step.
@@ -227,19 +261,27 @@ class TrustRegionSafeOptimizer(torch.optim.Optimizer):
         Raises:
             KeyError: if the closure's result lacks an entry.
             TypeError: if there is no closure, or it does not return a TensorDict.
-            ValueError: if an entry has the wrong shape, or a setting was put out of its range.
+            ValueError: if an entry has the wrong shape or does not depend on the parameters, the
+                KL does not start at zero, no parameter requires a gradient, or a setting was put
+                out of its range.
         """
         if not callable(closure):
             raise TypeError(f"step needs a closure that returns a TensorDict, got {closure!r}.")
         settings = self.param_groups[0]
         _check_settings(settings)
         params = [p for p in settings["params"] if p.requires_grad]
+        if not params:
+            raise ValueError("params must hold one that requires a gradient, got none that does.")
+        _check_params(params)
         backup = [p.detach().clone() for p in params]
         try:
-            return self._step(closure, params, backup, settings)
+            report = self._step(closure, params, backup, settings)
         except BaseException:
-            _restore(params, backup)
+            _move(params, backup)
             raise
+        if not report.accepted:
+            _move(params, backup)
+        return report
 
     def _step(
         self,
@@ -250,85 +292,81 @@ class TrustRegionSafeOptimizer(torch.optim.Optimizer):
     ) -> TrustRegionReport:
         with torch.enable_grad():
             out = self._call(closure)
-            before, old = self._evaluate(out, None)
+            old = None if self.statistics_kl is None else detach(out.get("statistics"))
+            before = self._evaluate(out, old)
+            if abs(before.kl) > settings["max_kl"]:
+                raise ValueError(
+                    "'kl' must be zero at the parameters the step starts from, got "
+                    f"{before.kl} with max_kl={settings['max_kl']}."
+                )
             report: dict[str, Any] = {
                 "objective": before.objective,
                 "constraint": tuple(before.constraint.tolist()),
             }
             try:
-                solution, direction, predicted, residual = self._direct(
-                    out, before, params, settings
-                )
-            except _Rejected as reason:
-                return TrustRegionReport("rejected", False, str(reason), **report)
-        report.update(cg_residual=residual)
-        del out
+                proposal = self._propose(out, before, params, settings)
+            except _Rejected as rejection:
+                return TrustRegionReport("rejected", False, str(rejection), **report)
+        report.update(case=proposal.case, cg_residual=proposal.cg_residual)
+        del out  # The graph, before the candidates are evaluated.
 
-        fraction, reason = 1.0, ""
+        moves = unflatten(proposal.direction, params)
+        reason = ""
         for backtracks in range(settings["max_backtracks"] + 1):
+            fraction = settings["backtrack_ratio"] ** backtracks
             with torch.no_grad():
-                for p, start, move in zip(
-                    params, backup, unflatten(direction, params), strict=True
-                ):
-                    p.copy_(start + fraction * move)
-                after, _ = self._evaluate(self._call(closure), old)
-            reason = _refusal(before, after, settings["max_kl"])
+                _move(params, torch._foreach_add(backup, moves, alpha=fraction))
+                after = self._evaluate(self._call(closure), old)
+            reason = _refusal(before, after, settings["max_kl"], proposal.tolerance)
             if not reason:
                 return TrustRegionReport(
-                    solution.case,
-                    True,
+                    accepted=True,
                     kl=after.kl,
                     step_fraction=fraction,
                     backtracks=backtracks,
                     objective_change=after.objective - before.objective,
-                    objective_predicted=fraction * predicted[0],
+                    objective_predicted=fraction * proposal.predicted[0],
                     constraint_change=tuple((after.constraint - before.constraint).tolist()),
-                    constraint_predicted=tuple(fraction * p for p in predicted[1:]),
+                    constraint_predicted=tuple(fraction * p for p in proposal.predicted[1:]),
                     **report,
                 )
-            fraction *= settings["backtrack_ratio"]
-        _restore(params, backup)
         return TrustRegionReport(
-            solution.case,
-            False,
-            f"the line search is exhausted: {reason}",
-            backtracks=settings["max_backtracks"],
+            accepted=False,
+            reason=f"the line search is exhausted: {reason}",
+            backtracks=settings["max_backtracks"] + 1,
             **report,
         )
 
-    def _direct(
+    def _propose(
         self,
         out: TensorDictBase,
         before: _Evaluation,
         params: list[Tensor],
         settings: dict[str, Any],
-    ) -> tuple[Subproblem, Tensor, list[float], float]:
-        """The subproblem's solution, its step [n], predicted changes [1 + m], and residual."""
+    ) -> _Proposal:
+        """Linearises, finds the natural gradients and solves the subproblem."""
         if not before.is_finite():
-            raise _Rejected("objective, constraint or KL is not finite")
-        if self.statistics_kl is not None:
-            product = gauss_newton_product(out.get("statistics"), self.statistics_kl, params)
-        else:
+            raise _Rejected(f"the closure returned {before}")
+        if self.statistics_kl is None:
             product = hessian_product(out.get("kl"), params)
-        outputs = [out.get("objective"), *before.constraint.size * [None]]
-        if before.constraint.size:
-            outputs[1:] = out.get("constraint").unbind()
-        gradients = torch.stack([_gradient(output, params) for output in outputs])
+        else:
+            product = gauss_newton_product(out.get("statistics"), self.statistics_kl, params)
+        gradients = _gradients(out, params)
         damping = settings["damping"]
-        solved = conjugate_gradient(
+        systems = conjugate_gradient(
             lambda vectors: product(vectors) + damping * vectors, gradients, settings["cg_iters"]
         )
-        # The only wait for the device before the line search.
-        gram = (gradients.double() @ solved.solution.double().T).cpu().numpy()
-        norms = gradients.norm(dim=-1)
-        relative = solved.residual.norm(dim=-1) / torch.where(norms > 0, norms, 1.0)
-        residual = relative.max().item()
-        if not (np.isfinite(gram).all() and math.isfinite(residual)):
-            raise _Rejected("a gradient or a curvature product is not finite")
-        if solved.negative.any():
-            raise _Rejected("the curvature is not positive definite")
-        # Unfinished conjugate gradients leave the two triangles slightly different.
-        gram = (gram + gram.T) / 2
+        residual = float(systems.relative_residual.max())
+        # Double precision also keeps reduced-precision matrix products out of the subproblem.
+        solved, wanted = systems.solution.double(), gradients.double()
+        linear = (wanted @ solved.T).cpu().numpy()
+        curvature = (solved @ (wanted - systems.residual.double()).T).cpu().numpy()
+        if not (math.isfinite(residual) and np.isfinite([linear, curvature]).all()):
+            raise _Rejected("a gradient or a product with the curvature is not finite")
+        flat = gradients.any(-1).cpu().numpy() & (np.diag(curvature) <= 0)
+        if flat.any() or bool(systems.negative.any()):
+            raise _Rejected("the curvature is not positive definite; more damping may help")
+        basis, gram = _galerkin(curvature, linear, torch.finfo(gradients.dtype).eps)
         solution = solve_subproblem(
             gram[0, 0],
             gram[1:, 0],
@@ -339,10 +377,17 @@ class TrustRegionSafeOptimizer(torch.optim.Optimizer):
         )
         if solution.reason:
             raise _Rejected(solution.reason)
-        weights = np.array([solution.objective_weight, *-solution.constraint_weight])
-        direction = torch.as_tensor(weights, dtype=gradients.dtype).to(gradients.device)
-        direction = direction @ solved.solution
-        return solution, direction, (gram @ weights).tolist(), residual
+        dual = np.array([solution.objective_weight, *-solution.constraint_weight])
+        if not dual.any():
+            raise _Rejected("the best step is none: no gradient leads anywhere better")
+        weights = torch.as_tensor(basis @ dual, device=solved.device)
+        return _Proposal(
+            case=solution.case,
+            direction=(weights @ solved).to(gradients.dtype),
+            predicted=(gram @ dual).tolist(),
+            tolerance=_TOLERANCE * np.sqrt(2 * settings["max_kl"] * np.diag(gram)[1:]),
+            cg_residual=residual,
+        )
 
     def _call(self, closure: Closure) -> TensorDictBase:
         out = closure()
@@ -359,61 +404,111 @@ class TrustRegionSafeOptimizer(torch.optim.Optimizer):
             if value is not None and value.shape != ():
                 raise ValueError(f"{key!r} must be a scalar, got shape {tuple(value.shape)}.")
         constraint = out.get("constraint", None)
-        if constraint is not None and constraint.ndim != 1:
-            raise ValueError(f"'constraint' must have shape [m], got {tuple(constraint.shape)}.")
+        if constraint is not None and (constraint.ndim != 1 or len(constraint) > MAX_CONSTRAINTS):
+            raise ValueError(
+                f"'constraint' must have shape [m] with m at most {MAX_CONSTRAINTS}, got shape "
+                f"{tuple(constraint.shape)}."
+            )
         return out
 
-    def _evaluate(self, out: TensorDictBase, old: Any) -> tuple[_Evaluation, Any]:
-        """A closure's numbers, and the statistics that later KLs refer to."""
-        if self.statistics_kl is None:
-            kl = out.get("kl")
-        elif old is None:
-            old = detach(out.get("statistics"))
-            kl = torch.zeros_like(out.get("objective"))
-        else:
-            kl = self.statistics_kl(old, out.get("statistics"))
-        values = [out.get("objective").reshape(1), kl.reshape(1)]
-        constraint = out.get("constraint", None)
-        if constraint is not None:
-            values.append(constraint)
-        numbers = torch.cat([value.detach().double() for value in values]).cpu().numpy()
-        return _Evaluation(float(numbers[0]), numbers[2:], float(numbers[1])), old
+    def _evaluate(self, out: TensorDictBase, old: Statistics | None) -> _Evaluation:
+        """A closure's numbers; ``old`` are the statistics that the KL refers to."""
+        with torch.no_grad():
+            if self.statistics_kl is None:
+                kl = out.get("kl")
+            else:
+                kl = self.statistics_kl(old, out.get("statistics"))
+                if kl.shape != ():
+                    raise ValueError(
+                        f"statistics_kl must return a scalar, got shape {tuple(kl.shape)}."
+                    )
+            values = [out.get("objective").reshape(1), kl.reshape(1)]
+            if out.get("constraint", None) is not None:
+                values.append(out.get("constraint"))
+            numbers = torch.cat([value.double() for value in values]).cpu().numpy()
+        return _Evaluation(float(numbers[0]), numbers[2:], float(numbers[1]))
 
 
-def _gradient(output: Tensor, params: list[Tensor]) -> Tensor:
-    if not output.requires_grad:
-        return torch.zeros_like(flatten(params))
-    return flatten(torch.autograd.grad(output, params, retain_graph=True, materialize_grads=True))
+def _gradients(out: TensorDictBase, params: list[Tensor]) -> Tensor:
+    """Gradients of the objective and of the constraints, [1 + m, n]."""
+    outputs = [("objective", out.get("objective"))]
+    if out.get("constraint", None) is not None:
+        outputs += [(f"constraint[{i}]", c) for i, c in enumerate(out.get("constraint").unbind())]
+    return torch.stack([flatten(gradient(name, [output], params)) for name, output in outputs])
 
 
-def _refusal(before: _Evaluation, after: _Evaluation, max_kl: float) -> str:
+def _galerkin(
+    curvature: NDArray[np.float64], linear: NDArray[np.float64], eps: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """The subproblem, restricted to the span of unfinished solutions ``X``.
+
+    Inside that span the natural gradients are ``X G^+ (L')``, with ``G = X'HX`` and ``L`` the
+    gradients' products with ``X``. Their Gram matrix is ``L G^+ L'`` however few iterations the
+    conjugate gradients had: the step's predicted changes and its size in the metric are exact.
+
+    Args:
+        curvature (numpy.ndarray): ``G``, shape [k, k].
+        linear (numpy.ndarray): ``L``, shape [k, k].
+        eps (float): resolution of the vectors' dtype; directions as similar as that count as one.
+
+    Returns:
+        tuple: coefficients of the natural gradients in ``X`` (in columns) and their Gram matrix.
+    """
+    scale = np.sqrt(np.diag(curvature))
+    scale = np.where(scale > 0, scale, 1.0)
+    unit = (curvature + curvature.T) / np.outer(2 * scale, scale)
+    inverse = np.linalg.pinv(unit, rcond=10 * eps, hermitian=True) / np.outer(scale, scale)
+    basis = inverse @ linear.T
+    gram = linear @ basis
+    return basis, (gram + gram.T) / 2
+
+
+def _refusal(
+    before: _Evaluation, after: _Evaluation, max_kl: float, tolerance: NDArray[np.float64]
+) -> str:
     """Why the line search turns a candidate down; empty if it does not."""
+    if after.constraint.shape != before.constraint.shape:
+        raise ValueError(
+            f"'constraint' must keep its shape during a step, got {before.constraint.shape}, then "
+            f"{after.constraint.shape}."
+        )
     if not after.is_finite():
-        return "objective, constraint or KL is not finite"
-    if after.kl > max_kl:
-        return "the KL is above max_kl"
-    if (after.constraint - before.constraint > np.maximum(-before.constraint, 0)).any():
-        return "a constraint is violated"
+        return f"the closure returned {after}"
+    if abs(after.kl) > (1 + _TOLERANCE) * max_kl:
+        return f"a KL of {after.kl} with max_kl={max_kl}"
+    excess = after.constraint - np.maximum(before.constraint, tolerance)
+    if (excess > 0).any():
+        i = excess.argmax()
+        return f"constraint[{i}] went from {before.constraint[i]} to {after.constraint[i]}"
     if (before.constraint <= 0).all() and after.objective < before.objective:
-        return "the objective fell"
+        return f"the objective fell from {before.objective} to {after.objective}"
     return ""
 
 
-def _restore(params: list[Tensor], backup: list[Tensor]) -> None:
+def _move(params: list[Tensor], values: list[Tensor] | tuple[Tensor, ...]) -> None:
     with torch.no_grad():
-        for p, start in zip(params, backup, strict=True):
-            p.copy_(start)
+        torch._foreach_copy_(params, values)
+
+
+def _check_params(params: list[Tensor]) -> None:
+    kinds = {(p.dtype, p.device) for p in params}
+    if len(kinds) != 1 or not params[0].is_floating_point():
+        raise ValueError(
+            "params must share one floating-point dtype and one device, got "
+            f"{sorted(f'{dtype} on {device}' for dtype, device in kinds)}."
+        )
 
 
 def _check_settings(settings: dict[str, Any]) -> None:
-    allowed: dict[str, tuple[Callable[[Any], bool], str]] = {
-        "max_kl": (lambda v: 0 < v < math.inf, "positive and finite"),
-        "damping": (lambda v: 0 <= v < math.inf, "finite and at least 0"),
-        "cg_iters": (lambda v: isinstance(v, int) and v >= 1, "an integer of at least 1"),
-        "backtrack_ratio": (lambda v: 0 < v < 1, "in (0, 1)"),
-        "max_backtracks": (lambda v: isinstance(v, int) and v >= 0, "an integer of at least 0"),
-        "recovery_ratio": (lambda v: 0 < v <= 1, "in (0, 1]"),
+    allowed: dict[str, tuple[type, Callable[[Any], bool], str]] = {
+        "max_kl": (Real, lambda v: 0 < v < math.inf, "a positive finite number"),
+        "damping": (Real, lambda v: 0 <= v < math.inf, "a finite number, at least 0"),
+        "cg_iters": (Integral, lambda v: v >= 1, "an integer, at least 1"),
+        "backtrack_ratio": (Real, lambda v: 0 < v < 1, "in (0, 1)"),
+        "max_backtracks": (Integral, lambda v: v >= 0, "an integer, at least 0"),
+        "recovery_ratio": (Real, lambda v: 0 < v <= 1, "in (0, 1]"),
     }
-    for name, (check, text) in allowed.items():
-        if not check(settings[name]):
-            raise ValueError(f"{name} must be {text}, got {settings[name]!r}.")
+    for name, (kind, check, text) in allowed.items():
+        value = settings[name]
+        if not (isinstance(value, kind) and check(value)):
+            raise ValueError(f"{name} must be {text}, got {value!r}.")

@@ -255,7 +255,9 @@ def main(cfg: DictConfig) -> None:
         print(f"stopped at {run.frames} frames; go on with the same command and resume=true")
         return
     run.save()
-    run.finish(make_env(cfg.eval.final_episodes, EVAL_SEED), policy)
+    final_env = make_env(cfg.eval.final_episodes, EVAL_SEED)
+    run.finish(final_env, policy)
+    final_env.close()
 
 
 if __name__ == "__main__":

@@ -333,17 +333,22 @@ class TestConstraint:
         with pytest.raises(ValueError, match="needs the reference"):
             loss.constraint(data, data["action"], level=level)
 
-    def test_mean_of_the_critic_over_visited_states(self):
+    def test_level_is_the_mean_value_of_visited_states(self):
         """A two-state chain that costs 1 in one state and 0 in the other, solved exactly."""
         gamma = 0.9
         transition = torch.tensor([[0.8, 0.2], [0.6, 0.4]], dtype=torch.float64)
         cost = torch.tensor([0.0, 1.0], dtype=torch.float64)
         value = torch.linalg.solve(torch.eye(2).double() - gamma * transition, cost)
-        visited = torch.tensor(
-            [0.75, 0.25], dtype=torch.float64
-        )  # stationary: visited @ T = visited
-        torch.testing.assert_close(visited @ transition, visited)
-        torch.testing.assert_close(visited @ value, visited @ cost / (1 - gamma))
+        visited = torch.tensor([0.75, 0.25], dtype=torch.float64)
+        torch.testing.assert_close(visited @ transition, visited)  # stationary
+
+        data = make_data((100, 200))
+        state = torch.multinomial(visited, 100, replacement=True)
+        for t in range(200):
+            data["next", "cost"][:, t, 0] = cost[state]
+            state = torch.multinomial(transition[state], 1).squeeze(-1)
+        loss = make_loss(gamma=gamma, risk_level=1.0)
+        assert loss.on_policy_cvar(data).item() == pytest.approx((visited @ value).item(), rel=0.02)
 
     def test_units_agree(self):
         """In a chain that costs c at each step, constraint and limit are both c / (1 - gamma).

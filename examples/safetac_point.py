@@ -170,7 +170,7 @@ def main(cfg: DictConfig) -> None:
     env = make_env(
         cfg.env.num_envs,
         seed=cfg.seed + run.frames,  # a resumed run sees new layouts
-        episode_length=cfg.env.episode_length,
+        episode_length=list(cfg.env.episode_length),
         stagger=True,
     )
     collector = Collector(

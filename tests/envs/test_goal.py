@@ -236,6 +236,13 @@ class TestEpisodes:
         assert (td["done"] == td["truncated"]).all()
         assert not td["terminated"].any()
 
+    def test_one_length_per_environment(self):
+        td = drive(make(5, episode_length=[3, 6]), actions(12, 5))["next"]
+        steps = torch.arange(1, 13)
+        for index in range(5):
+            length = 3 if index % 2 == 0 else 6
+            assert (td["truncated"][:, index, 0] == (steps % length == 0)).all()
+
     def test_stagger_spreads_the_truncations(self):
         env = make(5, episode_length=10, stagger=True)
         first = drive(env, actions(10, 5))["next", "truncated"].squeeze(-1)
@@ -394,6 +401,8 @@ class TestBadInput:
             ({"num_envs": 0}, "num_envs must be an integer >= 1, got 0"),
             ({"num_threads": -1}, "num_threads must be an integer >= 1, got -1"),
             ({"episode_length": 2.5}, "episode_length must be an integer >= 1, got 2.5"),
+            ({"episode_length": []}, "episode_length must have at least one entry"),
+            ({"episode_length": [5, 0]}, "episode_length must be an integer >= 1, got 0"),
             ({"seed": -1}, "seed must be None or an integer >= 0"),
             ({"task": GoalTask(num_hazards=80)}, "no legal layout found"),
             ({"task": GoalTask(extent=0.35)}, "does not fit"),

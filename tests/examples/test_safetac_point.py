@@ -20,7 +20,7 @@ EXAMPLES = Path(safetac_point.__file__).parent
 TINY = [
     "num_threads=1",
     "env.num_envs=20",
-    "env.episode_length=50",
+    "env.episode_length=[50,100]",
     "collector.frames_per_batch=400",
     "collector.init_frames=400",
     "replay_buffer.size=10000",
@@ -154,11 +154,11 @@ class TestLoggers:
         assert not (tmp_path / "run" / "log").exists()
 
     def test_command_line_with_wandb_offline(self, tmp_path):
-        """The script as a user starts it, with no account, no terminal and no settings of its own."""
+        """The script as a user starts it, with no account, no terminal, no settings."""
         env = {k: v for k, v in os.environ.items() if not k.startswith("WANDB")}
-        overrides = [*TINY, "collector.total_frames=400", "logger.backend=wandb", "video.num_steps=4"]
+        more = ["collector.total_frames=400", "logger.backend=wandb", "video.num_steps=4"]
         result = subprocess.run(
-            [sys.executable, str(EXAMPLES / "safetac_point.py"), "run_dir=run", *overrides],
+            [sys.executable, str(EXAMPLES / "safetac_point.py"), "run_dir=run", *TINY, *more],
             capture_output=True,
             text=True,
             timeout=300,

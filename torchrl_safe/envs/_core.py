@@ -6,6 +6,7 @@ are arrays here and not bodies in the physics model.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import mujoco
@@ -137,7 +138,8 @@ class GoalCore:
         num_envs (int): number of environments, N.
         num_threads (int): threads of the simulator.
         seed (int or None): seed of the random streams, one per environment.
-        episode_length (int): steps after which an episode is truncated.
+        episode_length (int or sequence of int): steps after which an episode is truncated; of a
+            sequence, environment i has entry ``i % len``.
         stagger (bool): whether a reset of all environments starts them at different phases of an
             episode.
 
@@ -153,13 +155,16 @@ class GoalCore:
         num_envs: int,
         num_threads: int,
         seed: int | None,
-        episode_length: int,
+        episode_length: int | Sequence[int],
         stagger: bool,
     ) -> None:
+        lengths = episode_length if isinstance(episode_length, Sequence) else [episode_length]
+        if not lengths:
+            raise ValueError("episode_length must have at least one entry, got an empty sequence.")
         for name, value in (
             ("num_envs", num_envs),
             ("num_threads", num_threads),
-            ("episode_length", episode_length),
+            *(("episode_length", length) for length in lengths),
         ):
             if not isinstance(value, int) or isinstance(value, bool) or value < 1:
                 raise ValueError(f"{name} must be an integer >= 1, got {value!r}.")
@@ -168,7 +173,7 @@ class GoalCore:
         self.robot = robot
         self.task = task
         self.num_envs = num_envs
-        self.episode_length = episode_length
+        self._episode_length = np.resize(lengths, num_envs)
         self.stagger = stagger
         self.instabilities = 0
         self.action_dim = robot.action_dim
@@ -212,7 +217,8 @@ class GoalCore:
         self._goal[rows], self._hazards[rows] = goal, hazards
         self._goal_distance[rows] = np.hypot(*(goal - position).T)
         staggered = self.stagger and mask is None
-        self._elapsed[rows] = rows * self.episode_length // self.num_envs if staggered else 0
+        phase = rows * self._episode_length[rows] // self.num_envs
+        self._elapsed[rows] = phase if staggered else 0
         self._started = True
         motion = Motion(*(part[rows] for part in self._robots.motion))
         scan, cost, violation = self._sense_hazards(motion, hazards)
@@ -260,7 +266,7 @@ class GoalCore:
         reward, goal_met = tasks.goal_reward(self.task, self._goal_distance, distance)
         scan, cost, violation = self._sense_hazards(motion, self._hazards)
         self._elapsed += 1
-        truncated = (self._elapsed >= self.episode_length) | failed
+        truncated = (self._elapsed >= self._episode_length) | failed
         if goal_met.any():
             rows = np.flatnonzero(goal_met)
             position = motion.position[rows]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -48,7 +48,9 @@ class SafeGoalEnv(EnvBase):
         seed (int or None): seed of the layouts; ``None`` takes one from the operating system. Give
             each worker of a multi-process collector another one, or their first episodes are the
             same. Default: 0.
-        episode_length (int): steps until truncation. Default: 1000.
+        episode_length (int or sequence of int): steps until truncation; of a sequence,
+            environment i has entry ``i % len``: short episodes show many layouts, long ones where
+            a policy ends up. Default: 1000.
         stagger (bool): start environment i of a reset without mask ``i * episode_length // N``
             steps into its episode, so that truncations, and with them new layouts, are spread over
             time. Default: ``False``.
@@ -73,7 +75,7 @@ class SafeGoalEnv(EnvBase):
         num_envs: int = 64,
         num_threads: int = 2,
         seed: int | None = 0,
-        episode_length: int = 1000,
+        episode_length: int | Sequence[int] = 1000,
         stagger: bool = False,
         task: GoalTask = GoalTask(),  # noqa: B008 (frozen)
         device: torch.device | str | None = None,

@@ -1,0 +1,86 @@
+"""A constrained trust-region step: curvature of policy moments beside that of a KL by itself."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from omegaconf import OmegaConf
+from safetac_point import policy_closure, policy_kl
+from tensordict import TensorDict
+from torch import nn
+from utils import make_critic, make_policy
+
+from torchrl_safe import CVaRCostLoss, TrustRegionSafeOptimizer, TsallisLoss
+from torchrl_safe.envs import SafeGoalEnv
+
+CONFIG = Path(__file__).parents[1] / "examples" / "safetac_point.yaml"
+NUM_STATES = 5000
+
+
+def in_terms_of_kl(closure: Callable[[], TensorDict]) -> Callable[[], TensorDict]:
+    """The same closure, for an optimizer that knows nothing of the policy's moments."""
+    with torch.no_grad():
+        old = closure()["statistics"]
+
+    def kl_closure() -> TensorDict:
+        out = closure()
+        out["kl"] = policy_kl(old, out.pop("statistics"))
+        return out
+
+    return kl_closure
+
+
+@pytest.mark.parametrize("curvature", ["gauss_newton", "double_backward"])
+@pytest.mark.parametrize("width", [128, 512], ids="24-{0}-{0}".format)
+def bench_step(benchmark: Any, width: int, curvature: str) -> None:
+    """One step from the same weights on the same states, line search included."""
+    benchmark.group = f"trust-region step, 24-{width}-{width}, 5 Gaussians, {NUM_STATES} states"
+    torch.manual_seed(0)
+    cfg = OmegaConf.load(CONFIG)
+    cfg.policy.num_cells = cfg.critic.num_cells = [width, width]
+    cfg.policy.num_components = 5
+    env = SafeGoalEnv(num_envs=1, num_threads=1)
+    policy = make_policy(cfg, env)
+    reward_loss = TsallisLoss(
+        policy,
+        make_critic(cfg, env, "state_action_value"),
+        entropic_index=cfg.loss.entropic_index,
+        alpha_init=cfg.loss.alpha,
+        fixed_alpha=True,
+        delay_qvalue=False,
+        deactivate_vmap=True,
+    )
+    cost_loss = CVaRCostLoss(
+        policy,
+        make_critic(cfg, env, "cost_value"),
+        make_critic(cfg, env, "cost_std", nn.Softplus()),
+        risk_level=cfg.loss.risk_level,
+        cost_limit=cfg.loss.cost_limit,
+        deactivate_vmap=True,
+    )
+    cost_loss.make_value_estimator(gamma=cfg.loss.gamma, lmbda=cfg.loss.lmbda)
+    optim = TrustRegionSafeOptimizer(
+        policy.parameters(),
+        max_kl=cfg.optim.max_kl,
+        damping=cfg.optim.damping,
+        cg_iters=10,
+        statistics_kl=policy_kl if curvature == "gauss_newton" else None,
+    )
+    states = TensorDict({"observation": torch.randn(NUM_STATES, 24)}, [NUM_STATES])
+    weights = [p.detach().clone() for p in policy.parameters()]
+    level = torch.tensor(cfg.loss.cost_limit)  # the constraint is active
+
+    def setup() -> tuple[tuple[Any], dict[str, Any]]:
+        torch.manual_seed(0)
+        with torch.no_grad():
+            torch._foreach_copy_(list(policy.parameters()), weights)
+        closure = policy_closure(policy, reward_loss, cost_loss, states, level)
+        return (closure if curvature == "gauss_newton" else in_terms_of_kl(closure),), {}
+
+    report = benchmark.pedantic(optim.step, setup=setup, rounds=5, warmup_rounds=1)
+    benchmark.extra_info |= {"case": report.case, "backtracks": report.backtracks}
+    assert report.accepted, report

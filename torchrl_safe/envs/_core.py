@@ -6,7 +6,7 @@ are arrays here and not bodies in the physics model.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple
 
 import mujoco
@@ -230,7 +230,7 @@ class GoalCore:
             goal_met=np.zeros(len(rows), bool),
             truncated=np.zeros(len(rows), bool),
         )
-        pairs = zip(self._frame, fresh, strict=True)
+        pairs: Iterable[tuple[NDArray[Any], NDArray[Any]]] = zip(self._frame, fresh, strict=True)
         self._frame = Frame(*(_with_rows(old, rows, new) for old, new in pairs))
         return self._frame
 

@@ -82,5 +82,5 @@ def bench_step(
     stepper: Callable[[int, int], Callable[[], object]],
     num_threads: int,
 ) -> None:
-    benchmark.group = f"a step of {num_envs} environments, {ROBOT.substeps} physics steps each"
+    benchmark.group = f"a step of {num_envs:3d} environments, {ROBOT.substeps} physics steps each"
     benchmark(stepper(num_envs, num_threads))

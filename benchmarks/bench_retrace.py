@@ -39,10 +39,9 @@ def bench_targets(benchmark: Any, shape: tuple[int, int], implementation: str) -
     """Targets of trajectories [B, T]; what they cost apart from the networks."""
     benchmark.group = f"targets of {shape[0]} trajectories of {shape[1]} steps"
     torch.manual_seed(0)
-    shape = (*shape, 1)
-    log_pi, log_mu, value, next_value, reward = torch.randn(5, *shape).unbind()
-    done = torch.rand(shape) < 0.01
-    terminated = done & (torch.rand(shape) < 0.5)
+    log_pi, log_mu, value, next_value, reward = torch.randn(5, *shape, 1).unbind()
+    done = torch.rand(*shape, 1) < 0.01
+    terminated = done & (torch.rand(*shape, 1) < 0.5)
     data = (log_pi, log_mu, value, next_value, reward, done, terminated)
     if implementation == "retrace":
         target = benchmark(retrace_lambda_return_estimate, GAMMA, LMBDA, *data)

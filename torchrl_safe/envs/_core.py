@@ -6,7 +6,7 @@ are arrays here and not bodies in the physics model.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from typing import Any, NamedTuple
 
 import mujoco
@@ -138,8 +138,7 @@ class GoalCore:
         num_envs (int): number of environments, N.
         num_threads (int): threads of the simulator.
         seed (int or None): seed of the random streams, one per environment.
-        episode_length (int or sequence of int): steps after which an episode is truncated; of a
-            sequence, environment i has entry ``i % len``.
+        episode_length (int): steps after which an episode is truncated.
         stagger (bool): whether a reset of all environments starts them at different phases of an
             episode.
 
@@ -155,25 +154,21 @@ class GoalCore:
         num_envs: int,
         num_threads: int,
         seed: int | None,
-        episode_length: int | Sequence[int],
+        episode_length: int,
         stagger: bool,
     ) -> None:
-        lengths = episode_length if isinstance(episode_length, Sequence) else [episode_length]
-        if not lengths:
-            raise ValueError("episode_length must have at least one entry, got an empty sequence.")
         for name, value in (
             ("num_envs", num_envs),
             ("num_threads", num_threads),
-            *(("episode_length", length) for length in lengths),
+            ("episode_length", episode_length),
         ):
-            if not isinstance(value, int) or isinstance(value, bool) or value < 1:
-                raise ValueError(f"{name} must be an integer >= 1, got {value!r}.")
+            check_count(name, value)
         # Fail where the options are given, not at the first reset of a worker process.
         tasks.sample_layout(task, robot.keepout, RandomStreams(0, 4), np.arange(4))
         self.robot = robot
         self.task = task
         self.num_envs = num_envs
-        self._episode_length = np.resize(lengths, num_envs)
+        self.episode_length = episode_length
         self.stagger = stagger
         self.instabilities = 0
         self.action_dim = robot.action_dim
@@ -217,8 +212,7 @@ class GoalCore:
         self._goal[rows], self._hazards[rows] = goal, hazards
         self._goal_distance[rows] = np.hypot(*(goal - position).T)
         staggered = self.stagger and mask is None
-        phase = rows * self._episode_length[rows] // self.num_envs
-        self._elapsed[rows] = phase if staggered else 0
+        self._elapsed[rows] = rows * self.episode_length // self.num_envs if staggered else 0
         self._started = True
         motion = Motion(*(part[rows] for part in self._robots.motion))
         scan, cost, violation = self._sense_hazards(motion, hazards)
@@ -266,7 +260,7 @@ class GoalCore:
         reward, goal_met = tasks.goal_reward(self.task, self._goal_distance, distance)
         scan, cost, violation = self._sense_hazards(motion, self._hazards)
         self._elapsed += 1
-        truncated = (self._elapsed >= self._episode_length) | failed
+        truncated = (self._elapsed >= self.episode_length) | failed
         if goal_met.any():
             rows = np.flatnonzero(goal_met)
             position = motion.position[rows]
@@ -347,6 +341,12 @@ class GoalCore:
         offset, distance = tasks.hazard_distances(motion.position, hazards)
         scan = tasks.lidar(self.task, offset, distance, motion.heading)
         return scan, *tasks.hazard_cost(self.task, distance)
+
+
+def check_count(name: str, value: object) -> None:
+    """Raise a ``ValueError`` unless ``value`` is a positive integer."""
+    if not isinstance(value, int) or isinstance(value, bool) or value < 1:
+        raise ValueError(f"{name} must be an integer >= 1, got {value!r}.")
 
 
 def _with_rows(array: NDArray[Any], rows: Rows | Mask, new: NDArray[Any]) -> NDArray[Any]:

@@ -17,6 +17,7 @@ import torch
 from omegaconf import DictConfig
 from tensordict import TensorDict, TensorDictBase
 from torch import nn
+from torchrl._utils import logger as torchrl_logger
 from torchrl._utils import timeit
 from torchrl.collectors import Collector
 from torchrl.data import LazyTensorStorage, SliceSampler, TensorDictReplayBuffer
@@ -102,6 +103,7 @@ def minibatches(data: TensorDictBase, size: int) -> Iterator[TensorDictBase]:
 @hydra.main(config_path=".", config_name="safetac_point", version_base="1.3")
 def main(cfg: DictConfig) -> None:
     """Train, evaluate and film an agent."""
+    torchrl_logger.setLevel("WARNING")  # its notes would break the progress bar
     use_threads(cfg.num_threads)
     torch.manual_seed(cfg.seed)
 

@@ -179,7 +179,7 @@ def main(cfg: DictConfig) -> None:
         env,
         policy,
         frames_per_batch=cfg.collector.frames_per_batch,
-        total_frames=max(cfg.collector.total_frames - run.frames, cfg.collector.frames_per_batch),
+        total_frames=cfg.collector.total_frames - run.frames,
         exploration_type=ExplorationType.RANDOM,
         auto_register_policy_transforms=False,
     )

@@ -85,6 +85,7 @@ class Run:
     Raises:
         FileExistsError: if the folder holds a run and ``cfg.resume`` is not set.
         FileNotFoundError: if there is nothing to resume.
+        ValueError: if the run to resume has all of its frames.
     """
 
     def __init__(self, cfg: DictConfig, **components: Any) -> None:
@@ -97,6 +98,11 @@ class Run:
         )
         if cfg.resume:
             self.rotation.load_latest(self.checkpoint)
+            if self.frames >= cfg.collector.total_frames:
+                raise ValueError(
+                    f"collector.total_frames={cfg.collector.total_frames} leaves nothing to do: "
+                    f"the run in run_dir={cfg.run_dir} has {self.frames} frames."
+                )
         elif (self.path / "config.yaml").exists():
             raise FileExistsError(
                 f"run_dir={cfg.run_dir} holds a run already: add resume=true to go on with it, or "

@@ -115,6 +115,10 @@ class TestRun:
                     first[name][1], second[name][1], rtol=0, atol=0, equal_nan=True, msg=name
                 )
 
+    def test_nothing_left_to_do(self, finished):
+        with pytest.raises(ValueError, match="total_frames=1600 leaves nothing to do"):
+            launch(finished, "collector.total_frames=1600", "resume=true")
+
     def test_refuses_to_mix_runs(self, finished):
         before = (finished / "results.json").read_bytes()
         with pytest.raises(FileExistsError, match="resume=true"):

@@ -172,7 +172,7 @@ def main(cfg: DictConfig) -> None:
     env = make_env(
         cfg.env.num_envs,
         seed=cfg.seed + run.frames,  # a resumed run sees new layouts
-        episode_length=cfg.env.episode_length,
+        episode_length=cfg.env.short_episodes,
         stagger=True,
     )
     collector = Collector(
@@ -199,6 +199,9 @@ def main(cfg: DictConfig) -> None:
             metrics["train/entropy"] = -batch["action_log_prob"].mean().item()
             buffer.extend(batch.select(*REPLAYED))
 
+            if run.frames >= cfg.env.short_until:
+                env.episode_length = cfg.env.episode_length
+
             if run.frames >= cfg.collector.init_frames:
                 for _ in range(cfg.optim.critic_rounds):
                     # Targets are renewed each round: one round is one step of value iteration.
@@ -220,6 +223,9 @@ def main(cfg: DictConfig) -> None:
                     visited = batch.select("observation").flatten()
                     states = visited[torch.randperm(len(visited))[: cfg.optim.policy_frames]]
                     level = cost_loss.on_policy_cvar(batch)
+                    done = min(run.frames / cfg.collector.total_frames, 1.0)
+                    max_kl = cfg.optim.max_kl + done * (cfg.optim.final_max_kl - cfg.optim.max_kl)
+                    policy_optim.param_groups[0]["max_kl"] = max_kl
                     report = policy_optim.step(
                         policy_closure(policy, reward_loss, cost_loss, states, level)
                     )

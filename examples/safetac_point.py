@@ -223,9 +223,6 @@ def main(cfg: DictConfig) -> None:
                     visited = batch.select("observation").flatten()
                     states = visited[torch.randperm(len(visited))[: cfg.optim.policy_frames]]
                     level = cost_loss.on_policy_cvar(batch)
-                    done = min(run.frames / cfg.collector.total_frames, 1.0)
-                    max_kl = cfg.optim.max_kl + done * (cfg.optim.final_max_kl - cfg.optim.max_kl)
-                    policy_optim.param_groups[0]["max_kl"] = max_kl
                     report = policy_optim.step(
                         policy_closure(policy, reward_loss, cost_loss, states, level)
                     )

@@ -172,7 +172,7 @@ def main(cfg: DictConfig) -> None:
     env = make_env(
         cfg.env.num_envs,
         seed=cfg.seed + run.frames,  # a resumed run sees new layouts
-        episode_length=cfg.env.short_episodes,
+        episode_length=cfg.env.episode_length,
         stagger=True,
     )
     collector = Collector(
@@ -198,9 +198,6 @@ def main(cfg: DictConfig) -> None:
             metrics["train/total_cvs"] = run.counters["total_cvs"]
             metrics["train/entropy"] = -batch["action_log_prob"].mean().item()
             buffer.extend(batch.select(*REPLAYED))
-
-            if run.frames >= cfg.env.short_until:
-                env.episode_length = cfg.env.episode_length
 
             if run.frames >= cfg.collector.init_frames:
                 for _ in range(cfg.optim.critic_rounds):

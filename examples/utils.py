@@ -48,6 +48,7 @@ def make_policy(cfg: DictConfig, env: EnvBase) -> GMMTanhPolicy:
         num_components=cfg.policy.num_components,
         relaxation=cfg.policy.relaxation,
         temperature=cfg.policy.temperature,
+        log_std_bounds=tuple(cfg.policy.log_std_bounds),
     )
 
 

@@ -236,17 +236,6 @@ class TestEpisodes:
         assert (td["done"] == td["truncated"]).all()
         assert not td["terminated"].any()
 
-    def test_length_can_change(self):
-        env = make(2, episode_length=3)
-        first = drive(env, actions(7, 2))["next", "truncated"][..., 0]
-        assert (first == torch.tensor([t % 3 == 0 for t in range(1, 8)])[:, None]).all()
-        env.episode_length = 5  # one step into an episode
-        second = drive(env, actions(9, 2), reset=False)["next", "truncated"][..., 0]
-        assert (second == torch.tensor([t in (4, 9) for t in range(1, 10)])[:, None]).all()
-        with pytest.raises(ValueError, match="episode_length must be an integer >= 1, got 0"):
-            env.episode_length = 0
-        assert env.episode_length == 5
-
     def test_stagger_spreads_the_truncations(self):
         env = make(5, episode_length=10, stagger=True)
         first = drive(env, actions(10, 5))["next", "truncated"].squeeze(-1)

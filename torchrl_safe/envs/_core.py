@@ -162,7 +162,8 @@ class GoalCore:
             ("num_threads", num_threads),
             ("episode_length", episode_length),
         ):
-            check_count(name, value)
+            if not isinstance(value, int) or isinstance(value, bool) or value < 1:
+                raise ValueError(f"{name} must be an integer >= 1, got {value!r}.")
         # Fail where the options are given, not at the first reset of a worker process.
         tasks.sample_layout(task, robot.keepout, RandomStreams(0, 4), np.arange(4))
         self.robot = robot
@@ -341,12 +342,6 @@ class GoalCore:
         offset, distance = tasks.hazard_distances(motion.position, hazards)
         scan = tasks.lidar(self.task, offset, distance, motion.heading)
         return scan, *tasks.hazard_cost(self.task, distance)
-
-
-def check_count(name: str, value: object) -> None:
-    """Raise a ``ValueError`` unless ``value`` is a positive integer."""
-    if not isinstance(value, int) or isinstance(value, bool) or value < 1:
-        raise ValueError(f"{name} must be an integer >= 1, got {value!r}.")
 
 
 def _with_rows(array: NDArray[Any], rows: Rows | Mask, new: NDArray[Any]) -> NDArray[Any]:

@@ -13,7 +13,7 @@ from tensordict import TensorDict, TensorDictBase
 from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
 
-from torchrl_safe.envs._core import Frame, GoalCore, check_count
+from torchrl_safe.envs._core import Frame, GoalCore
 from torchrl_safe.envs.robots import get_robot
 from torchrl_safe.envs.tasks import GoalTask
 
@@ -48,8 +48,7 @@ class SafeGoalEnv(EnvBase):
         seed (int or None): seed of the layouts; ``None`` takes one from the operating system. Give
             each worker of a multi-process collector another one, or their first episodes are the
             same. Default: 0.
-        episode_length (int): steps until truncation; may be changed later, for the episodes
-            under way too. Default: 1000.
+        episode_length (int): steps until truncation. Default: 1000.
         stagger (bool): start environment i of a reset without mask ``i * episode_length // N``
             steps into its episode, so that truncations, and with them new layouts, are spread over
             time. Default: ``False``.
@@ -159,16 +158,6 @@ class SafeGoalEnv(EnvBase):
 
     def _set_seed(self, seed: int | None) -> None:
         self._core.seed(seed)
-
-    @property
-    def episode_length(self) -> int:
-        """Steps until truncation."""
-        return self._core.episode_length
-
-    @episode_length.setter
-    def episode_length(self, value: int) -> None:
-        check_count("episode_length", value)
-        self._core.episode_length = value
 
     @property
     def instabilities(self) -> int:

@@ -106,6 +106,7 @@ class TestSpecs:
         root = {
             "observation": (24, torch.float32),
             "violation": (1, torch.bool),
+            "violations": (1, torch.int64),
             "goal_met": (1, torch.bool),
             "done": (1, torch.bool),
             "terminated": (1, torch.bool),
@@ -207,6 +208,7 @@ class TestRewardAndCost:
                 cost = 1 / (1 + math.exp(-10 * (0.2 - nearest)))
                 assert following["cost"][i].item() == pytest.approx(cost, abs=1e-6)
                 assert following["violation"][i].item() == (nearest <= 0.2)
+                assert following["violations"][i].item() == (nearest <= 0.2)
                 # The observation shows the new goal.
                 shown = following["observation"][i, 2].item() * 0.6 + 1.5
                 goal_distance = math.dist(after["goal"], after["robot"])
@@ -224,7 +226,7 @@ class TestRewardAndCost:
             td["action"] = seek(env)
             step, td = env.step_and_maybe_reset(td)
             fresh = step["next", "done"].squeeze(-1)
-            for key in ("violation", "goal_met", "done", "terminated", "truncated"):
+            for key in ("violation", "violations", "goal_met", "done", "terminated", "truncated"):
                 assert not td[key][fresh].any()
 
 

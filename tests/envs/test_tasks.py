@@ -7,9 +7,10 @@ import math
 import numpy as np
 import pytest
 
-from torchrl_safe.envs import GoalTask, Robot, get_robot, tasks
+from torchrl_safe.envs import GoalTask, Robot, get_robot
 from torchrl_safe.envs._random import RandomStreams
 from torchrl_safe.envs.robots import Motion, to_robot_frame
+from torchrl_safe.envs.tasks import goal as tasks
 
 KEEPOUT = 0.4
 

@@ -1,7 +1,7 @@
-"""The simulator behind every face of the goal environments: numpy in, numpy out, N at a time.
+"""The simulator behind every face of the environments: numpy in, numpy out, N at a time.
 
-This is the only file that touches MuJoCo's thread pool. Hazards and goals never collide, so they
-are arrays here and not bodies in the physics model.
+This is the only file that touches MuJoCo's thread pool. It moves robots and keeps episodes; what
+is around the robots belongs to the task, as arrays and not as bodies in the physics model.
 """
 
 from __future__ import annotations
@@ -14,10 +14,9 @@ import numpy as np
 from mujoco.batch import Batch, SimulationError
 from numpy.typing import NDArray
 
-from torchrl_safe.envs import tasks
 from torchrl_safe.envs._random import RandomStreams
-from torchrl_safe.envs.robots import Array, Motion, Robot
-from torchrl_safe.envs.tasks import GoalTask
+from torchrl_safe.envs.robots import Array, Motion, Robot, get_robot
+from torchrl_safe.envs.tasks import TASKS, Objects, Task
 
 Rows = NDArray[np.integer]
 Mask = NDArray[np.bool_]
@@ -121,35 +120,26 @@ class Frame(NamedTuple):
     reward: Array
     cost: Array
     violation: Mask
+    violations: NDArray[np.int64]
     goal_met: Mask
+    terminated: Mask
     truncated: Mask
 
 
-class GoalCore:
-    """The goal task on N robots: layouts, episodes, rewards and costs.
+class Core:
+    """A task on N robots: episodes, resets, state. Everything else is the task's.
 
     A simulation that diverges is put back where it was, and its episode is truncated: it repeats
     its last observation and cost without a reward, and nothing non-finite reaches a learner.
     ``instabilities`` counts them.
 
-    Args:
-        robot (Robot): the robot.
-        task (GoalTask): the options of the task.
-        num_envs (int): number of environments, N.
-        num_threads (int): threads of the simulator.
-        seed (int or None): seed of the random streams, one per environment.
-        episode_length (int): steps after which an episode is truncated.
-        stagger (bool): whether a reset of all environments starts them at different phases of an
-            episode.
-
-    Raises:
-        ValueError: if an option is out of range or the objects do not fit the task's square.
+    Built by :func:`make_core`.
     """
 
     def __init__(
         self,
         robot: Robot,
-        task: GoalTask,
+        task: Task,
         *,
         num_envs: int,
         num_threads: int,
@@ -165,7 +155,7 @@ class GoalCore:
             if not isinstance(value, int) or isinstance(value, bool) or value < 1:
                 raise ValueError(f"{name} must be an integer >= 1, got {value!r}.")
         # Fail where the options are given, not at the first reset of a worker process.
-        tasks.sample_layout(task, robot.keepout, RandomStreams(0, 4), np.arange(4))
+        *_, objects = task.sample(robot, RandomStreams(0, 4), np.arange(4))
         self.robot = robot
         self.task = task
         self.num_envs = num_envs
@@ -173,17 +163,16 @@ class GoalCore:
         self.stagger = stagger
         self.instabilities = 0
         self.action_dim = robot.action_dim
-        self._scale = np.array(robot.proprioception_scale)
-        self.observation_size = tasks.observation_size(task, len(self._scale))
+        self.observation_size = task.observation_size(robot)
         self._robots = RobotBatch(robot, num_envs, num_threads)
         self._started = False
-        self._hazards = np.zeros((num_envs, task.num_hazards, 2))
-        self._goal = np.zeros((num_envs, 2))
-        self._goal_distance = np.zeros(num_envs)
+        self._objects: Objects = {
+            name: np.zeros((num_envs, *value.shape[1:])) for name, value in objects.items()
+        }
         self._elapsed = np.zeros(num_envs, np.int64)
         zero, no = np.zeros(num_envs), np.zeros(num_envs, bool)
         blank = np.zeros((num_envs, self.observation_size), np.float32)
-        self._frame = Frame(blank, zero, zero, no, no, no)
+        self._frame = Frame(blank, zero, zero, no, no.astype(np.int64), no, no, no)
         self.seed(seed)
 
     def seed(self, seed: int | None) -> None:
@@ -206,24 +195,26 @@ class GoalCore:
             rows = np.flatnonzero(mask)
         if not rows.size:
             return self._frame
-        position, yaw, goal, hazards = tasks.sample_layout(
-            self.task, self.robot.keepout, self._streams, rows
-        )
+        position, yaw, objects = self.task.sample(self.robot, self._streams, rows)
         self._robots.place(rows, position, yaw)
-        self._goal[rows], self._hazards[rows] = goal, hazards
-        self._goal_distance[rows] = np.hypot(*(goal - position).T)
+        self._objects = {
+            name: _with_rows(old, rows, objects[name]) for name, old in self._objects.items()
+        }
         staggered = self.stagger and mask is None
         self._elapsed[rows] = rows * self.episode_length // self.num_envs if staggered else 0
         self._started = True
         motion = Motion(*(part[rows] for part in self._robots.motion))
-        scan, cost, violation = self._sense_hazards(motion, hazards)
+        sensed = self.task.sense(self.robot, motion, objects)
+        no = np.zeros(len(rows), bool)
         fresh = Frame(
-            tasks.observe(motion, goal, scan, self._scale),
+            self.task.observe(self.robot, motion, objects, sensed.scan),
             reward=np.zeros(len(rows)),
-            cost=cost,
-            violation=violation,
-            goal_met=np.zeros(len(rows), bool),
-            truncated=np.zeros(len(rows), bool),
+            cost=sensed.cost,
+            violation=sensed.violation,
+            violations=sensed.violation.astype(np.int64),
+            goal_met=no,
+            terminated=no,
+            truncated=no,
         )
         pairs: Iterable[tuple[NDArray[Any], NDArray[Any]]] = zip(self._frame, fresh, strict=True)
         self._frame = Frame(*(_with_rows(old, rows, new) for old, new in pairs))
@@ -256,32 +247,31 @@ class GoalCore:
             raise ValueError(f"action must be finite; it is not in environments {bad.tolist()}.")
         failed = self._robots.step(np.clip(action, -1.0, 1.0))
         self.instabilities += int(failed.sum())
-        motion = self._robots.motion
-        distance = np.hypot(*(self._goal - motion.position).T)
-        reward, goal_met = tasks.goal_reward(self.task, self._goal_distance, distance)
-        scan, cost, violation = self._sense_hazards(motion, self._hazards)
         self._elapsed += 1
-        truncated = (self._elapsed >= self.episode_length) | failed
-        if goal_met.any():
-            rows = np.flatnonzero(goal_met)
-            position = motion.position[rows]
-            self._goal[rows] = tasks.sample_goal(
-                self.task, self.robot.keepout, position, self._hazards[rows], self._streams, rows
-            )
-            distance[rows] = np.hypot(*(self._goal[rows] - position).T)
-        self._goal_distance = distance
-        observation = tasks.observe(motion, self._goal, scan, self._scale)
-        self._frame = Frame(observation, reward, cost, violation, goal_met, truncated)
+        remaining = np.maximum(self.episode_length - self._elapsed, 0)
+        robot, motion = self.robot, self._robots.motion
+        sensed = self.task.sense(robot, motion, self._objects)
+        outcome = self.task.advance(robot, motion, self._objects, sensed, remaining, self._streams)
+        self._objects = outcome.objects
+        self._frame = Frame(
+            self.task.observe(robot, motion, self._objects, sensed.scan),
+            outcome.reward,
+            outcome.cost,
+            outcome.violations > 0,
+            outcome.violations,
+            outcome.goal_met,
+            outcome.terminated,
+            truncated=(remaining == 0) | failed,
+        )
         return self._frame
 
     def layout(self, index: int) -> dict[str, Array]:
-        """Copies of robot [2], heading [2], goal [2], hazards [H, 2] of one environment, metres."""
+        """Copies of robot [2], heading [2] and the task's objects of one environment, metres."""
         motion = self._robots.motion
         return {
             "robot": motion.position[index].copy(),
             "heading": motion.heading[index].copy(),
-            "goal": self._goal[index].copy(),
-            "hazards": self._hazards[index].copy(),
+            **{name: value[index].copy() for name, value in self._objects.items()},
         }
 
     def qpos(self, index: int) -> Array:
@@ -298,9 +288,7 @@ class GoalCore:
         state = {
             "physics": self._robots.state,
             **self._robots.motion._asdict(),
-            "hazards": self._hazards,
-            "goal": self._goal,
-            "goal_distance": self._goal_distance,
+            **self._objects,
             "elapsed": self._elapsed,
             "random": self._streams.state,
             "started": np.array(self._started),
@@ -331,17 +319,50 @@ class GoalCore:
         copy = {name: np.array(value) for name, value in snapshot.items()}
         self._robots.state[:] = copy["physics"]
         self._robots.motion = Motion(*(copy[name] for name in Motion._fields))
-        self._hazards, self._goal = copy["hazards"], copy["goal"]
-        self._goal_distance, self._elapsed = copy["goal_distance"], copy["elapsed"]
+        self._objects = {name: copy[name] for name in self._objects}
+        self._elapsed = copy["elapsed"]
         self._streams.state = copy["random"]
         self._started = bool(copy["started"])
         self.instabilities = int(copy["instabilities"])
         self._frame = Frame(*(copy[f"frame_{name}"] for name in Frame._fields))
 
-    def _sense_hazards(self, motion: Motion, hazards: Array) -> tuple[Array, Array, Mask]:
-        offset, distance = tasks.hazard_distances(motion.position, hazards)
-        scan = tasks.lidar(self.task, offset, distance, motion.heading)
-        return scan, *tasks.hazard_cost(self.task, distance)
+
+def make_core(
+    robot: str | Robot,
+    task: Task | None = None,
+    *,
+    num_envs: int,
+    num_threads: int,
+    seed: int | None,
+    episode_length: int,
+    stagger: bool = False,
+) -> Core:
+    """N environments of one robot and one task: what every face of ours wraps.
+
+    Args:
+        robot (str or Robot): the robot, or its name.
+        task (Task, optional): the task with its options. Default: that of the robot.
+        num_envs (int): number of environments, N.
+        num_threads (int): threads of the simulator.
+        seed (int or None): seed of the random streams, one per environment.
+        episode_length (int): steps after which an episode is truncated.
+        stagger (bool): whether a reset of all environments starts them at different phases of an
+            episode.
+
+    Raises:
+        ValueError: if the robot is unknown, an option is out of range or the objects do not fit.
+    """
+    if isinstance(robot, str):
+        robot = get_robot(robot)
+    return Core(
+        robot,
+        TASKS[robot.task]() if task is None else task,
+        num_envs=num_envs,
+        num_threads=num_threads,
+        seed=seed,
+        episode_length=episode_length,
+        stagger=stagger,
+    )
 
 
 def _with_rows(array: NDArray[Any], rows: Rows | Mask, new: NDArray[Any]) -> NDArray[Any]:

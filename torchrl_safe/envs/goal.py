@@ -13,9 +13,8 @@ from tensordict import TensorDict, TensorDictBase
 from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
 
-from torchrl_safe.envs._core import Frame, GoalCore
-from torchrl_safe.envs.robots import get_robot
-from torchrl_safe.envs.tasks import GoalTask
+from torchrl_safe.envs._core import Frame, make_core
+from torchrl_safe.envs.tasks import GoalTask, Task
 
 
 class SafeGoalEnv(EnvBase):
@@ -31,8 +30,8 @@ class SafeGoalEnv(EnvBase):
     * ``observation``, [N, 24] for Point with 16 lidar bins: goal direction in the robot frame (2),
       goal distance, acceleration (2), velocity (2), yaw rate, lidar; fixed scaling;
     * ``reward`` and ``cost``, [N, 1];
-    * ``violation``, [N, 1] bool, inside a hazard; ``goal_met``, [N, 1] bool, goal reached in this
-      step;
+    * ``violation``, [N, 1] bool, inside a hazard; ``violations``, [N, 1] int64, how many violating
+      steps this one counts for, here 0 or 1; ``goal_met``, [N, 1] bool, goal reached in this step;
     * ``done``, ``terminated``, ``truncated``, [N, 1] bool.
 
     Each environment draws from its own random stream, so its layouts depend on the seed and its
@@ -52,7 +51,7 @@ class SafeGoalEnv(EnvBase):
         stagger (bool): start environment i of a reset without mask ``i * episode_length // N``
             steps into its episode, so that truncations, and with them new layouts, are spread over
             time. Default: ``False``.
-        task (GoalTask): the options of the task.
+        task (Task, optional): the task with its options. Default: the robot's.
         device (torch.device, optional): device of the tensors; the simulation runs on the CPU.
 
     Raises:
@@ -75,11 +74,11 @@ class SafeGoalEnv(EnvBase):
         seed: int | None = 0,
         episode_length: int = 1000,
         stagger: bool = False,
-        task: GoalTask = GoalTask(),  # noqa: B008 (frozen)
+        task: Task | None = None,
         device: torch.device | str | None = None,
     ) -> None:
-        core = GoalCore(
-            get_robot(robot),
+        core = make_core(
+            robot,
             task,
             num_envs=num_envs,
             num_threads=num_threads,
@@ -100,6 +99,7 @@ class SafeGoalEnv(EnvBase):
                 (num_envs, core.observation_size), device=device, dtype=torch.float32
             ),
             violation=flag(),
+            violations=Bounded(0, episode_length, (num_envs, 1), device=device, dtype=torch.int64),
             goal_met=flag(),
             shape=(num_envs,),
             device=device,
@@ -109,7 +109,9 @@ class SafeGoalEnv(EnvBase):
         )
         self.full_reward_spec = Composite(
             reward=Unbounded((num_envs, 1), device=device, dtype=torch.float32),
-            cost=Bounded(0.0, 1.0, (num_envs, 1), device=device, dtype=torch.float32),
+            cost=Bounded(
+                0.0, core.task.max_cost, (num_envs, 1), device=device, dtype=torch.float32
+            ),
             shape=(num_envs,),
             device=device,
         )
@@ -134,21 +136,21 @@ class SafeGoalEnv(EnvBase):
         action = tensordict.get("action").detach().cpu().numpy()
         frame = self._core.step(action)
         rewards = {
-            "reward": torch.from_numpy(frame.reward[:, None].astype(np.float32)),
-            "cost": torch.from_numpy(frame.cost[:, None].astype(np.float32)),
+            "reward": _column(frame.reward).float(),
+            "cost": _column(frame.cost).float(),
         }
         return self._to_tensordict(frame, rewards)
 
     def _to_tensordict(self, frame: Frame, rewards: dict[str, torch.Tensor]) -> TensorDictBase:
-        truncated = _flag(frame.truncated)
         source = {
             # Copies: whoever gets these tensors may write to them.
             "observation": torch.from_numpy(frame.observation.copy()),
-            "violation": _flag(frame.violation),
-            "goal_met": _flag(frame.goal_met),
-            "done": truncated,
-            "terminated": torch.zeros_like(truncated),
-            "truncated": truncated.clone(),
+            "violation": _column(frame.violation),
+            "violations": _column(frame.violations),
+            "goal_met": _column(frame.goal_met),
+            "done": _column(frame.terminated | frame.truncated),
+            "terminated": _column(frame.terminated),
+            "truncated": _column(frame.truncated),
             **rewards,
         }
         device = self.device
@@ -171,8 +173,8 @@ class SafeGoalEnv(EnvBase):
             index (int): the environment.
 
         Returns:
-            dict of arrays: ``robot`` [2], ``heading`` [2] (unit vector), ``goal`` [2], ``hazards``
-            [H, 2]; metres.
+            dict of arrays: ``robot`` [2], ``heading`` [2] (unit vector) and the task's objects:
+            ``goal`` [2], ``goal_distance`` [], ``hazards`` [H, 2]; metres.
 
         Examples:
             >>> env = SafeGoalEnv(num_envs=2, num_threads=1)
@@ -206,7 +208,10 @@ class SafeGoalEnv(EnvBase):
             self._renderer.close()
             self._renderer = None
         if self._renderer is None:
-            self._renderer = SceneRenderer(self._core.robot, self._core.task, width, height)
+            task = self._core.task
+            if not isinstance(task, GoalTask):
+                raise NotImplementedError(f"there is no picture of {task} yet.")
+            self._renderer = SceneRenderer(self._core.robot, task, width, height)
         return self._renderer.draw(
             self._core.qpos(index),
             self._core.layout(index),
@@ -265,5 +270,5 @@ class SafeGoalEnv(EnvBase):
         return {**self.__dict__, "_renderer": None}
 
 
-def _flag(value: NDArray[np.bool_]) -> torch.Tensor:
+def _column(value: NDArray[Any]) -> torch.Tensor:
     return torch.from_numpy(value[:, None].copy())

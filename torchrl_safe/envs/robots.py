@@ -45,6 +45,7 @@ class Robot:
         place (callable): ``(position [N, 2], yaw [N]) -> qpos [N, nq]``, the robot at rest there.
         control (callable): ``(action [N, A], qpos [N, nq], qvel [N, nv]) -> ctrl [N, nu]``.
         sense (callable): ``(qpos [N, nq], qvel [N, nv], qacc [N, nv]) -> Motion``.
+        task (str): the name of the task it does by default.
 
     Examples:
         >>> get_robot("point").substeps
@@ -61,6 +62,7 @@ class Robot:
     place: Callable[[Array, Array], Array]
     control: Callable[[Array, Array, Array], Array]
     sense: Callable[[Array, Array, Array], Motion]
+    task: str = "goal"
 
     @property
     def asset_path(self) -> Path:

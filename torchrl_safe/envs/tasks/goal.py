@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 from scipy.special import expit
 
 from torchrl_safe.envs._random import RandomStreams
-from torchrl_safe.envs.robots import Array, Motion, to_robot_frame
+from torchrl_safe.envs.robots import Array, Motion, Robot, to_robot_frame
+from torchrl_safe.envs.tasks.base import Objects, Outcome, Sensed
 
 _LAYOUT_CANDIDATES = 32  # positions tried for one object before its layout is started again
 _LAYOUT_ATTEMPTS = 100  # layouts started before giving up
@@ -82,10 +83,62 @@ class GoalTask:
                 f"got {self.hazard_keepout}."
             )
 
+    @property
+    def max_cost(self) -> float:
+        """The largest cost of a step."""
+        return 1.0
 
-def observation_size(task: GoalTask, proprioception_size: int) -> int:
-    """Length D of the observation: goal direction (2) and distance (1), proprioception, lidar."""
-    return 3 + proprioception_size + task.lidar_bins
+    def observation_size(self, robot: Robot) -> int:
+        """Goal direction (2) and distance (1), proprioception, lidar."""
+        return 3 + len(robot.proprioception_scale) + self.lidar_bins
+
+    def sample(
+        self, robot: Robot, streams: RandomStreams, rows: NDArray[np.integer]
+    ) -> tuple[Array, Array, Objects]:
+        """See :func:`sample_layout`; the objects are goal, its distance, and hazards."""
+        position, yaw, goal, hazards = sample_layout(self, robot.keepout, streams, rows)
+        distance = _norm(goal - position)
+        return position, yaw, {"goal": goal, "goal_distance": distance, "hazards": hazards}
+
+    def sense(self, robot: Robot, motion: Motion, objects: Objects) -> Sensed:
+        """Lidar and cost of the hazards; nothing blocks the robot."""
+        offset, distance = hazard_distances(motion.position, objects["hazards"])
+        scan = lidar(self, offset, distance, motion.heading)
+        return Sensed(scan, *hazard_cost(self, distance), contact=np.zeros(len(scan), bool))
+
+    def advance(
+        self,
+        robot: Robot,
+        motion: Motion,
+        objects: Objects,
+        sensed: Sensed,
+        remaining: NDArray[np.int64],
+        streams: RandomStreams,
+    ) -> Outcome:
+        """The reward to the goal the step started with; a reached goal moves."""
+        goal, hazards = objects["goal"], objects["hazards"]
+        distance = _norm(goal - motion.position)
+        reward, goal_met = goal_reward(self, objects["goal_distance"], distance)
+        if goal_met.any():
+            rows = np.flatnonzero(goal_met)
+            position = motion.position[rows]
+            goal = goal.copy()
+            goal[rows] = sample_goal(self, robot.keepout, position, hazards[rows], streams, rows)
+            distance[rows] = _norm(goal[rows] - position)
+        return Outcome(
+            {"goal": goal, "goal_distance": distance, "hazards": hazards},
+            reward,
+            sensed.cost,
+            sensed.violation.astype(np.int64),
+            goal_met,
+            terminated=sensed.contact,
+        )
+
+    def observe(
+        self, robot: Robot, motion: Motion, objects: Objects, scan: Array
+    ) -> NDArray[np.float32]:
+        """See :func:`observe`."""
+        return observe(motion, objects["goal"], scan, np.array(robot.proprioception_scale))
 
 
 def sample_layout(

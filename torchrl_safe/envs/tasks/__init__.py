@@ -1,0 +1,8 @@
+"""The tasks, one per file: pure functions over a batch, without a simulator."""
+
+from torchrl_safe.envs.tasks.base import Objects, Outcome, Sensed, Task
+from torchrl_safe.envs.tasks.goal import GoalTask
+
+__all__ = ["TASKS", "GoalTask", "Objects", "Outcome", "Sensed", "Task"]
+
+TASKS: dict[str, type[Task]] = {"goal": GoalTask}

@@ -8,13 +8,13 @@ from typing import Any
 
 import pytest
 import torch
+from critics import make_losses
 from omegaconf import OmegaConf
 from safetac_point import policy_closure, policy_kl
 from tensordict import TensorDict
-from torch import nn
-from utils import make_critic, make_policy
+from utils import make_policy
 
-from torchrl_safe import CVaRCostLoss, TrustRegionSafeOptimizer, TsallisLoss
+from torchrl_safe import TrustRegionSafeOptimizer
 from torchrl_safe.envs import SafeGoalEnv
 
 CONFIG = Path(__file__).parents[1] / "examples" / "safetac_point.yaml"
@@ -45,24 +45,7 @@ def bench_step(benchmark: Any, width: int, curvature: str) -> None:
     cfg.policy.num_components = 5
     env = SafeGoalEnv(num_envs=1, num_threads=1)
     policy = make_policy(cfg, env)
-    reward_loss = TsallisLoss(
-        policy,
-        make_critic(cfg, env, "state_action_value"),
-        entropic_index=cfg.loss.entropic_index,
-        alpha_init=cfg.loss.alpha,
-        fixed_alpha=True,
-        delay_qvalue=False,
-        deactivate_vmap=True,
-    )
-    cost_loss = CVaRCostLoss(
-        policy,
-        make_critic(cfg, env, "cost_value"),
-        make_critic(cfg, env, "cost_std", nn.Softplus()),
-        risk_level=cfg.loss.risk_level,
-        cost_limit=cfg.loss.cost_limit,
-        deactivate_vmap=True,
-    )
-    cost_loss.make_value_estimator(gamma=cfg.loss.gamma, lmbda=cfg.loss.lmbda)
+    reward_loss, cost_loss = make_losses(cfg, env, policy)
     optim = TrustRegionSafeOptimizer(
         policy.parameters(),
         max_kl=cfg.optim.max_kl,

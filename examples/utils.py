@@ -1,10 +1,11 @@
-"""What the example scripts share: networks and a run folder."""
+"""What the example scripts share: networks, the training loop around an update, a run folder."""
 
 from __future__ import annotations
 
 import json
 import os
 import signal
+import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from types import FrameType
@@ -14,14 +15,21 @@ import torch
 from omegaconf import DictConfig, OmegaConf
 from tensordict import TensorDictBase
 from torch import nn
+from torchrl._utils import logger as torchrl_logger
+from torchrl._utils import timeit
 from torchrl.checkpoint import Checkpoint, CheckpointRotation, GlobalRNGState
+from torchrl.collectors import Collector
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType
 from torchrl.modules import MLP, ValueOperator
 from torchrl.record.loggers import get_logger
+from tqdm import tqdm
 
 from torchrl_safe import GMMTanhPolicy
+from torchrl_safe.envs import SafeGoalEnv
 from torchrl_safe.record import (
+    batch_metrics,
+    count_violations,
     evaluate,
     format_table,
     plot_learning_curves,
@@ -31,6 +39,21 @@ from torchrl_safe.record import (
 
 # Evaluation layouts are the same for every run, and never those of training (seeded by cfg.seed).
 EVAL_SEED = 1_000_003
+
+
+def set_up(cfg: DictConfig) -> None:
+    """Threads, seed and a quiet logger: the first thing that a script does."""
+    torchrl_logger.setLevel("WARNING")  # its notes would break the progress bar
+    if "OMP_NUM_THREADS" not in os.environ:
+        torch.set_num_threads(cfg.num_threads)
+    torch.manual_seed(cfg.seed)
+
+
+def make_env(cfg: DictConfig, num_envs: int, seed: int, **kwargs: Any) -> SafeGoalEnv:
+    """A batch of environments with the robot of the configuration."""
+    return SafeGoalEnv(
+        cfg.env.robot, num_envs=num_envs, num_threads=cfg.num_threads, seed=seed, **kwargs
+    )
 
 
 def make_policy(cfg: DictConfig, env: EnvBase) -> GMMTanhPolicy:
@@ -62,6 +85,86 @@ def make_critic(cfg: DictConfig, env: EnvBase, out_key: str, *last: nn.Module) -
     )
     network.extend(last)
     return ValueOperator(network, in_keys=["observation", "action"], out_keys=[out_key])
+
+
+def train(
+    run: Run,
+    policy: GMMTanhPolicy,
+    update: Callable[[TensorDictBase], dict[str, float]],
+    eval_env: EnvBase,
+) -> None:
+    """Collect, update, log, evaluate and save until the frames are spent; then finish the run.
+
+    Args:
+        run (Run): the run's folder, resumed or new.
+        policy (GMMTanhPolicy): acts, and is what ``update`` improves.
+        update (callable): an algorithm's step on a new batch ``[N, T]``; its metrics are logged.
+        eval_env (EnvBase): environments of the evaluations during training.
+    """
+    cfg = run.cfg
+    env = make_env(
+        cfg,
+        cfg.env.num_envs,
+        seed=cfg.seed + run.frames,  # a resumed run sees new layouts
+        episode_length=cfg.env.episode_length,
+        stagger=True,
+    )
+    collector = Collector(
+        env,
+        policy,
+        frames_per_batch=cfg.collector.frames_per_batch,
+        total_frames=cfg.collector.total_frames - run.frames,
+        exploration_type=ExplorationType.RANDOM,
+        auto_register_policy_transforms=False,
+    )
+    progress = tqdm(total=cfg.collector.total_frames, initial=run.frames, unit="frame")
+    next_eval, next_save = (
+        run.frames // interval * interval + interval
+        for interval in (cfg.eval.interval, cfg.checkpoint.interval)
+    )
+    started = time.perf_counter()
+    with GracefulStop() as stop:
+        for batch in collector:
+            run.counters["frames"] += batch.numel()
+            run.counters["total_cvs"] += count_violations(batch)
+            metrics = batch_metrics(batch)
+            metrics["train/total_cvs"] = run.counters["total_cvs"]
+            metrics["train/entropy"] = -batch["action_log_prob"].mean().item()
+            metrics |= update(batch)
+
+            if run.frames >= next_eval:
+                next_eval += cfg.eval.interval
+                with timeit("time/eval"):
+                    metrics |= run.evaluate(eval_env, policy)
+                run.plot()
+            seconds = time.perf_counter() - started
+            started += seconds
+            run.counters["seconds"] += seconds
+            metrics |= timeit.todict(percall=False)
+            metrics["time/frames_per_second"] = batch.numel() / seconds
+            timeit.erase()
+            run.log(metrics)
+            progress.update(batch.numel())
+            progress.set_postfix(
+                reward=f"{metrics['train/reward_per_1000']:.1f}",
+                cost=f"{metrics['train/cost_rate']:.3f}",
+                cv=f"{metrics['train/cv_rate']:.4f}",
+                kl=f"{metrics.get('update/kl', 0.0):.4f}",
+            )
+            if run.frames >= next_save or stop.requested:
+                next_save += cfg.checkpoint.interval
+                run.save()
+            if stop.requested:
+                break
+    progress.close()
+    collector.shutdown()
+    if stop.requested:
+        print(f"stopped at {run.frames} frames; go on with the same command and resume=true")
+        return
+    run.save()
+    final_env = make_env(cfg, cfg.eval.final_episodes, EVAL_SEED)
+    run.finish(final_env, policy)
+    final_env.close()
 
 
 class Counters(dict):
@@ -218,9 +321,3 @@ class GracefulStop:
         if self.requested:
             raise KeyboardInterrupt
         self.requested = True
-
-
-def use_threads(count: int) -> None:
-    """Bound torch's threads, unless the environment says otherwise."""
-    if "OMP_NUM_THREADS" not in os.environ:
-        torch.set_num_threads(count)

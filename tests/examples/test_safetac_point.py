@@ -12,6 +12,7 @@ import hydra
 import pytest
 import safetac_point
 import torch
+import utils
 from omegaconf import OmegaConf
 
 from torchrl_safe import record
@@ -61,7 +62,7 @@ def interrupted(monkeypatch):
                 signal.raise_signal(number)
             return record.count_violations(batch)
 
-        monkeypatch.setattr(safetac_point, "count_violations", count_violations)
+        monkeypatch.setattr(utils, "count_violations", count_violations)
 
     return interrupt
 

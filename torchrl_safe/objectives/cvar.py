@@ -445,12 +445,9 @@ class CVaRCostLoss(LossModule):
         """
         keys = self.tensor_keys
         with torch.no_grad():
-            _, std = self._predict(
-                tensordict,
-                tensordict.get(keys.action),
-                self.cost_network_params,
-                self.std_network_params,
-            )
+            std = self._vmap_std_network(
+                tensordict.select(*self.std_network.in_keys), self.std_network_params
+            ).get(keys.cost_std)
             mean = tensordict.get(_next(keys.cost)).mean() / (1 - self.value_estimator.gamma)
             return gaussian_cvar(mean, std.mean(), self.risk_level)
 

@@ -1,4 +1,4 @@
-"""A constrained trust-region step: curvature of policy moments beside that of a KL by itself."""
+"""A constrained trust-region step, and the part of it that solves for the natural gradients."""
 
 from __future__ import annotations
 
@@ -12,13 +12,44 @@ from critics import make_losses
 from omegaconf import OmegaConf
 from safetac_point import policy_closure, policy_kl
 from tensordict import TensorDict
+from torch import Tensor
 from utils import make_policy
 
-from torchrl_safe import TrustRegionSafeOptimizer
+from torchrl_safe import GMMTanhPolicy, TrustRegionSafeOptimizer
 from torchrl_safe.envs import SafeGoalEnv
+from torchrl_safe.optim.curvature import (
+    Product,
+    conjugate_gradient,
+    flatten,
+    gauss_newton_product,
+    gradient,
+    hessian_product,
+)
 
 CONFIG = Path(__file__).parents[1] / "examples" / "safetac_point.yaml"
 NUM_STATES = 5000
+CG_ITERS = 10
+
+
+def make_closures(
+    width: int,
+) -> tuple[Any, GMMTanhPolicy, TensorDict, Callable[..., Callable[[], TensorDict]]]:
+    """Configuration, policy, states, and a maker of closures with an active constraint."""
+    torch.manual_seed(0)
+    cfg = OmegaConf.load(CONFIG)
+    cfg.policy.num_cells = cfg.critic.num_cells = [width, width]
+    cfg.policy.num_components = 5
+    env = SafeGoalEnv(num_envs=1, num_threads=1)
+    policy = make_policy(cfg, env)
+    losses = make_losses(cfg, env, policy)
+    states = TensorDict({"observation": torch.randn(NUM_STATES, 24)}, [NUM_STATES])
+    level = torch.tensor(cfg.loss.cost_limit)
+
+    def closure_of(curvature_frames: int | None = None) -> Callable[[], TensorDict]:
+        torch.manual_seed(0)
+        return policy_closure(policy, *losses, states, level, curvature_frames)
+
+    return cfg, policy, states, closure_of
 
 
 def in_terms_of_kl(closure: Callable[[], TensorDict]) -> Callable[[], TensorDict]:
@@ -34,36 +65,90 @@ def in_terms_of_kl(closure: Callable[[], TensorDict]) -> Callable[[], TensorDict
     return kl_closure
 
 
-@pytest.mark.parametrize("curvature", ["gauss_newton", "double_backward"])
+def rebuilt_hessian_product(policy: GMMTanhPolicy, states: TensorDict) -> Product:
+    """Double backward as most CPO code has it: the KL and its gradient anew for every product."""
+    params = list(policy.parameters())
+
+    def moments() -> TensorDict:
+        mean, cov = policy.get_dist(states).moments
+        return TensorDict({"mean": mean, "cov": cov})
+
+    def product(vectors: Tensor) -> Tensor:
+        rows = []
+        for vector in vectors:
+            new = moments()
+            slope = flatten(
+                gradient("kl", [policy_kl(new.detach(), new)], params, create_graph=True)
+            )
+            rows.append(flatten(gradient("slope", [slope @ vector], params)))
+        return torch.stack(rows)
+
+    return product
+
+
+@pytest.mark.parametrize(
+    "curvature",
+    ["gauss_newton", "gauss_newton_quarter", "double_backward", "double_backward_rebuilt"],
+)
+@pytest.mark.parametrize("width", [128, 512], ids="24-{0}-{0}".format)
+def bench_natural_gradients(benchmark: Any, width: int, curvature: str) -> None:
+    """Conjugate gradients for g and b, from the closure's outputs to both solutions."""
+    benchmark.group = f"natural gradients of g and b, 24-{width}-{width}, {NUM_STATES} states"
+    cfg, policy, states, closure_of = make_closures(width)
+    params = list(policy.parameters())
+    out = closure_of(NUM_STATES // 4)()
+    old = out["statistics"].detach().clone()
+    outputs = [out["objective"], out["constraint"].squeeze()]
+    rhs = torch.stack([flatten(gradient("g, b", [output], params)) for output in outputs])
+
+    def make_product() -> Product:
+        if curvature == "gauss_newton":
+            return gauss_newton_product(out["statistics"], policy_kl, params)
+        if curvature == "gauss_newton_quarter":
+            return gauss_newton_product(out["curvature_statistics"], policy_kl, params)
+        if curvature == "double_backward":
+            return hessian_product(policy_kl(old, out["statistics"]), params)
+        return rebuilt_hessian_product(policy, states)
+
+    def solve(make_product: Callable[[], Product]) -> Tensor:
+        product = make_product()
+        damping = cfg.optim.damping
+        return conjugate_gradient(lambda v: product(v) + damping * v, rhs, CG_ITERS).solution
+
+    solution = benchmark.pedantic(solve, args=(make_product,), rounds=5, warmup_rounds=1)
+    exact = solve(lambda: hessian_product(policy_kl(old, out["statistics"]), params))
+    cosine = torch.cosine_similarity(solution, exact).min().item()
+    benchmark.extra_info["smallest cosine to double backward"] = round(cosine, 6)
+    assert cosine > (0.9 if curvature == "gauss_newton_quarter" else 0.9999)
+
+
+@pytest.mark.parametrize("curvature", ["gauss_newton", "gauss_newton_quarter", "double_backward"])
 @pytest.mark.parametrize("width", [128, 512], ids="24-{0}-{0}".format)
 def bench_step(benchmark: Any, width: int, curvature: str) -> None:
     """One step from the same weights on the same states, line search included."""
     benchmark.group = f"trust-region step, 24-{width}-{width}, 5 Gaussians, {NUM_STATES} states"
-    torch.manual_seed(0)
-    cfg = OmegaConf.load(CONFIG)
-    cfg.policy.num_cells = cfg.critic.num_cells = [width, width]
-    cfg.policy.num_components = 5
-    env = SafeGoalEnv(num_envs=1, num_threads=1)
-    policy = make_policy(cfg, env)
-    reward_loss, cost_loss = make_losses(cfg, env, policy)
+    cfg, policy, _, closure_of = make_closures(width)
     optim = TrustRegionSafeOptimizer(
         policy.parameters(),
         max_kl=cfg.optim.max_kl,
         damping=cfg.optim.damping,
-        cg_iters=10,
-        statistics_kl=policy_kl if curvature == "gauss_newton" else None,
+        cg_iters=CG_ITERS,
+        statistics_kl=None if curvature == "double_backward" else policy_kl,
     )
-    states = TensorDict({"observation": torch.randn(NUM_STATES, 24)}, [NUM_STATES])
     weights = [p.detach().clone() for p in policy.parameters()]
-    level = torch.tensor(cfg.loss.cost_limit)  # the constraint is active
 
     def setup() -> tuple[tuple[Any], dict[str, Any]]:
-        torch.manual_seed(0)
         with torch.no_grad():
             torch._foreach_copy_(list(policy.parameters()), weights)
-        closure = policy_closure(policy, reward_loss, cost_loss, states, level)
-        return (closure if curvature == "gauss_newton" else in_terms_of_kl(closure),), {}
+        closure = closure_of(NUM_STATES // 4 if curvature == "gauss_newton_quarter" else None)
+        return (in_terms_of_kl(closure) if curvature == "double_backward" else closure,), {}
 
     report = benchmark.pedantic(optim.step, setup=setup, rounds=5, warmup_rounds=1)
-    benchmark.extra_info |= {"case": report.case, "backtracks": report.backtracks}
+    benchmark.extra_info |= {
+        "case": report.case,
+        "backtracks": report.backtracks,
+        "kl": round(report.kl, 5),
+        "objective_change": round(report.objective_change, 5),
+        "constraint_change": round(report.constraint_change[0], 5) if report.accepted else 0.0,
+    }
     assert report.accepted, report

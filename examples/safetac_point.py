@@ -19,7 +19,13 @@ from tensordict import TensorDict, TensorDictBase
 from torchrl._utils import timeit
 from utils import EVAL_SEED, Run, make_env, make_policy, set_up, train
 
-from torchrl_safe import CVaRCostLoss, GMMTanhPolicy, TrustRegionSafeOptimizer, TsallisLoss
+from torchrl_safe import (
+    CVaRCostLoss,
+    GMMTanhPolicy,
+    TanhGaussianMixture,
+    TrustRegionSafeOptimizer,
+    TsallisLoss,
+)
 from torchrl_safe.objectives.functional import moment_matched_kl
 
 
@@ -29,12 +35,19 @@ def policy_closure(
     cost_loss: CVaRCostLoss,
     states: TensorDictBase,
     level: torch.Tensor,
+    curvature_frames: int | None = None,
 ) -> Callable[[], TensorDict]:
     """Objective, constraint and policy moments of (13) as a function of the policy's weights.
 
     ``level`` is the CVaR that the policy of now is known to have; the critics say how it changes.
     The noise of the actions is drawn here, once: the line search then compares policies, not draws.
+    Curvature is that of the first ``curvature_frames`` states, all of them by default.
     """
+
+    def moments(dist: TanhGaussianMixture) -> dict[str, torch.Tensor]:
+        mean, cov = dist.moments
+        return {"mean": mean, "cov": cov}
+
     with torch.no_grad():
         dist = policy.get_dist(states)
         noise = dist.draw_noise()
@@ -43,16 +56,16 @@ def policy_closure(
     def closure() -> TensorDict:
         dist = policy.get_dist(states)
         action, log_prob = dist.rsample_and_log_prob(noise=noise)
-        mean, cov = dist.moments
-        return TensorDict(
-            {
-                "objective": reward_loss.objective(states, action, log_prob).mean(),
-                "constraint": cost_loss.constraint(
-                    states, action, reference=reference, level=level
-                )[None],
-                "statistics": {"mean": mean, "cov": cov},
-            }
-        )
+        out = {
+            "objective": reward_loss.objective(states, action, log_prob).mean(),
+            "constraint": cost_loss.constraint(states, action, reference=reference, level=level)[
+                None
+            ],
+            "statistics": moments(dist),
+        }
+        if curvature_frames is not None:
+            out["curvature_statistics"] = moments(policy.get_dist(states[:curvature_frames]))
+        return TensorDict(out)
 
     return closure
 
@@ -108,7 +121,9 @@ def main(cfg: DictConfig) -> None:
             states = visited[torch.randperm(len(visited))[: cfg.optim.policy_frames]]
             level = cost_loss.on_policy_cvar(batch)
             report = policy_optim.step(
-                policy_closure(policy, reward_loss, cost_loss, states, level)
+                policy_closure(
+                    policy, reward_loss, cost_loss, states, level, cfg.optim.curvature_frames
+                )
             )
         metrics = {**report.to_dict(), **losses}
         metrics["update/constraint"] += cfg.loss.cost_limit

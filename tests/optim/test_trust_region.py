@@ -166,6 +166,54 @@ def test_predictions_and_region_are_exact_however_few_the_cg_iterations(m, cg_it
     assert (c.numpy() + predicted <= 1e-7).all()
 
 
+# -- curvature of part of the batch
+
+
+def linear_policy(seed=0, states=400, size=6):
+    """Means ``A x`` of unit Gaussians in every state: the KL is quadratic, H is known."""
+    g = torch.Generator().manual_seed(seed)
+    a = torch.randn(states, size, generator=g, dtype=torch.float64)
+    return a * torch.linspace(0.5, 2, size), torch.randn(size, generator=g, dtype=torch.float64)
+
+
+def mean_kl(old, new):
+    return 0.5 * (new - old).square().mean()
+
+
+@pytest.mark.parametrize("part", [40, 400])
+def test_curvature_statistics_replace_the_batch_in_the_direction_only(part):
+    a, g = linear_policy()
+    x = nn.Parameter(torch.zeros(6, dtype=torch.float64))
+
+    def closure():
+        return TensorDict(
+            {"objective": g @ x, "statistics": a @ x, "curvature_statistics": a[:part] @ x}
+        )
+
+    report = optimizer(x, statistics_kl=mean_kl).step(closure)
+    natural = torch.linalg.solve(a[:part].T @ a[:part] / part, g)
+    full = report.step_fraction * math.sqrt(2 * 0.02 / (g @ natural)) * natural
+    torch.testing.assert_close(x.detach(), full)
+    # The region is that of the whole batch.
+    assert report.kl == pytest.approx(0.5 * (a @ x.detach()).square().mean().item())
+    assert report.accepted
+    assert report.kl <= 0.0202
+    assert (report.kl == pytest.approx(0.02)) == (part == 400)
+
+
+def test_a_kl_alone_has_no_curvature_statistics():
+    a, g = linear_policy()
+    x = nn.Parameter(torch.zeros(6, dtype=torch.float64))
+
+    def closure():
+        kl = 0.5 * (a @ x).square().mean()
+        return TensorDict({"objective": g @ x, "kl": kl, "curvature_statistics": a[:40] @ x})
+
+    with pytest.raises(ValueError, match="'curvature_statistics' needs statistics_kl"):
+        optimizer(x, statistics_kl=None).step(closure)
+    assert (x == 0).all()
+
+
 # -- the line search
 
 

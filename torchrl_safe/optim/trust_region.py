@@ -165,7 +165,10 @@ class TrustRegionSafeOptimizer(torch.optim.Optimizer):
     * ``"statistics"``: a tensor or TensorDict that determines the policy on the batch, such as its
       moments, with ``statistics_kl`` given to the constructor. The KL is then
       ``statistics_kl(old, new)``, and its curvature products are exact Gauss-Newton ones,
-      linearised once a step.
+      linearised once a step;
+    * ``"curvature_statistics"``: the same on part of the batch, optional. Curvature products are
+      then taken there, and cost accordingly less; the line search measures the KL on all of
+      ``"statistics"`` as ever.
 
     Args:
         params (iterable of Parameter): parameters of the policy, in one group. Those that do not
@@ -350,7 +353,10 @@ class TrustRegionSafeOptimizer(torch.optim.Optimizer):
         if self.statistics_kl is None:
             product = hessian_product(out.get("kl"), params)
         else:
-            product = gauss_newton_product(out.get("statistics"), self.statistics_kl, params)
+            statistics = out.get("curvature_statistics", None)
+            if statistics is None:
+                statistics = out.get("statistics")
+            product = gauss_newton_product(statistics, self.statistics_kl, params)
         gradients = _gradients(out, params)
         damping = settings["damping"]
         systems = conjugate_gradient(
@@ -399,6 +405,8 @@ class TrustRegionSafeOptimizer(torch.optim.Optimizer):
                 raise KeyError(
                     f"the closure's result lacks {key!r}; it has {sorted(map(str, out.keys()))}."
                 )
+        if self.statistics_kl is None and out.get("curvature_statistics", None) is not None:
+            raise ValueError("'curvature_statistics' needs statistics_kl, which is None.")
         for key in ("objective", "kl"):
             value = out.get(key, None)
             if value is not None and value.shape != ():

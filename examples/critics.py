@@ -14,6 +14,7 @@ from torchrl.envs import EnvBase
 from utils import make_critic
 
 from torchrl_safe import CVaRCostLoss, GMMTanhPolicy, TsallisLoss
+from torchrl_safe.objectives.value import with_policy
 
 REPLAYED = [
     "observation",
@@ -111,7 +112,8 @@ def with_targets(
 ) -> TensorDictBase:
     """Transitions of trajectories [B, T] with the targets of (4) and (18), flat."""
     parts = []
-    for part in trajectories.split(500):  # activations of this many stay in the cache
+    for part in trajectories.split(250):  # activations of this many stay in the cache
+        part = with_policy(part, reward_loss.actor_network, shifted=True)
         target = reward_loss.compute_target(part)
         cost_target, std_target = cost_loss.compute_target(part)
         targets = {"value_target": target, "cost_target": cost_target, "std_target": std_target}

@@ -355,7 +355,8 @@ class CVaRCostLoss(LossModule):
         """Retrace targets of both critics (18).
 
         Args:
-            tensordict (TensorDictBase): trajectories ``[*B, T]``.
+            tensordict (TensorDictBase): trajectories ``[*B, T]``; those of
+                :func:`~torchrl_safe.objectives.value.with_policy` spare evaluating the policy.
 
         Returns:
             Targets of the mean and of the standard deviation, without gradient, each of the
@@ -375,8 +376,10 @@ class CVaRCostLoss(LossModule):
                 self.actor_network, preserve_module_state=False
             ),
         ):
-            next_dist = self.actor_network.get_dist(next_tensordict)
-            next_action, _ = sample_and_log_prob(next_dist)
+            next_action = next_tensordict.get("policy_action", None)
+            if next_action is None:
+                next_dist = self.actor_network.get_dist(next_tensordict)
+                next_action, _ = sample_and_log_prob(next_dist)
             action = tensordict.get(keys.action)
             data = tensordict.select(
                 keys.log_prob,
@@ -392,8 +395,10 @@ class CVaRCostLoss(LossModule):
                 for prediction in self._predict(next_tensordict, next_action, *critics)
             )
             if isinstance(estimator, RetraceEstimator):
-                dist = self.actor_network.get_dist(tensordict)
-                data.set(estimator_keys.policy_log_prob, dist.log_prob(action))
+                log_prob = tensordict.get(estimator_keys.policy_log_prob, None)
+                if log_prob is None:
+                    log_prob = self.actor_network.get_dist(tensordict).log_prob(action)
+                data.set(estimator_keys.policy_log_prob, log_prob)
             cost = data.get(_next(keys.cost))
             terminated = data.get(_next(keys.terminated), data.get(_next(keys.done)))
 

@@ -231,7 +231,8 @@ class TsallisLoss(SACLoss):
 
         Args:
             tensordict (TensorDictBase): transitions ``[*B]``, or trajectories ``[*B, T]`` where
-                the value estimator looks further than one step.
+                the value estimator looks further than one step; those of
+                :func:`~torchrl_safe.objectives.value.with_policy` spare evaluating the policy.
 
         Returns:
             The target without gradient, of the shape of the reward, ``[*B, 1]``.
@@ -248,10 +249,12 @@ class TsallisLoss(SACLoss):
             if self.skip_done_states:
                 alive = ~next_tensordict.get(self.tensor_keys.terminated).squeeze(-1)
                 states = next_tensordict[alive]
-            with self.target_actor_network_params.to_module(
-                self.actor_network, preserve_module_state=False
-            ):
-                action, log_prob = sample_and_log_prob(self.actor_network.get_dist(states))
+            action, log_prob = (states.get(f"policy_{k}", None) for k in ("action", "log_prob"))
+            if action is None or log_prob is None:
+                with self.target_actor_network_params.to_module(
+                    self.actor_network, preserve_module_state=False
+                ):
+                    action, log_prob = sample_and_log_prob(self.actor_network.get_dist(states))
             value = self._action_value(states, action, self.target_qvalue_network_params)
             value = value - self._alpha * q_logarithm(log_prob, self.entropic_index)
             if alive is not None:

@@ -8,10 +8,12 @@ from torchrl_safe.objectives.value.functional import (
     retrace_variance_reward,
     squared_td_error,
 )
+from torchrl_safe.objectives.value.policy import with_policy
 
 __all__ = [
     "RetraceEstimator",
     "retrace_lambda_return_estimate",
     "retrace_variance_reward",
     "squared_td_error",
+    "with_policy",
 ]

@@ -75,6 +75,12 @@ def policy_kl(old: TensorDictBase, new: TensorDictBase) -> torch.Tensor:
     return moment_matched_kl(old["mean"], old["cov"], new["mean"], new["cov"]).mean()
 
 
+def cost_limit_at(cfg: DictConfig, frames: int) -> float:
+    """The limit of now: it falls, so that the agent learns to drive before it has to avoid."""
+    remaining = max(0.0, 1.0 - frames / max(1, cfg.loss.anneal_frames))
+    return cfg.loss.cost_limit + remaining * (cfg.loss.initial_cost_limit - cfg.loss.cost_limit)
+
+
 def make_trust_region(cfg: DictConfig, policy: GMMTanhPolicy) -> TrustRegionSafeOptimizer:
     """The optimizer of the policy, with the options of the configuration."""
     return TrustRegionSafeOptimizer(
@@ -115,6 +121,8 @@ def main(cfg: DictConfig) -> None:
         buffer.extend(batch.select(*REPLAYED))
         if run.frames < cfg.collector.init_frames:
             return {}
+        limit = cost_limit_at(cfg, run.frames)
+        cost_loss.cost_limit.fill_(limit)
         losses = fit_critics(cfg, buffer, reward_loss, cost_loss, critic_optim)
         with timeit("time/policy"):
             visited = batch.select("observation").flatten()
@@ -125,8 +133,8 @@ def main(cfg: DictConfig) -> None:
                     policy, reward_loss, cost_loss, states, level, cfg.optim.curvature_frames
                 )
             )
-        metrics = {**report.to_dict(), **losses}
-        metrics["update/constraint"] += cfg.loss.cost_limit
+        metrics = {**report.to_dict(), **losses, "update/cost_limit": limit}
+        metrics["update/constraint"] += limit
         return metrics
 
     train(run, policy, update, eval_env)

@@ -258,9 +258,7 @@ class Run:
     def plot(self) -> None:
         """Draw the learning curves; they need the csv log."""
         if self.cfg.logger.backend == "csv":
-            plot_learning_curves(
-                self.path / "log", self.path / "curves.png", cost_limit=self.cfg.loss.cost_limit
-            )
+            plot_learning_curves(self.path / "log", self.path / "curves.png")
 
     def finish(self, env: EnvBase, policy: Callable[[TensorDictBase], TensorDictBase]) -> None:
         """Final evaluation, table, curves and video."""

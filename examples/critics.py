@@ -51,7 +51,7 @@ def make_losses(
         variance_reward=cfg.loss.variance_reward,
         deactivate_vmap=True,
     )
-    cost_loss.make_value_estimator(gamma=cfg.loss.gamma, lmbda=cfg.loss.lmbda)
+    cost_loss.make_value_estimator(gamma=cfg.loss.cost_gamma, lmbda=cfg.loss.lmbda)
     return reward_loss, cost_loss
 
 

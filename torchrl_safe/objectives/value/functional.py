@@ -1,4 +1,8 @@
-"""Off-policy multi-step targets: one pure function per equation."""
+"""Off-policy multi-step targets: one pure function per equation.
+
+The four targets of Munos et al., 2016 (https://arxiv.org/abs/1606.02647, table 1) differ in the
+coefficient of one recursion, :func:`_trace_return_estimate`.
+"""
 
 from __future__ import annotations
 
@@ -7,7 +11,14 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-__all__ = ["retrace_lambda_return_estimate", "retrace_variance_reward", "squared_td_error"]
+__all__ = [
+    "importance_sampling_lambda_return_estimate",
+    "q_lambda_return_estimate",
+    "retrace_lambda_return_estimate",
+    "retrace_variance_reward",
+    "squared_td_error",
+    "tree_backup_lambda_return_estimate",
+]
 
 
 def retrace_lambda_return_estimate(
@@ -21,9 +32,10 @@ def retrace_lambda_return_estimate(
     done: Tensor,
     terminated: Tensor | None = None,
     *,
+    vectorized: bool = True,
     time_dim: int = -2,
 ) -> Tensor:
-    r"""Retrace(:math:`\lambda`) target of an action value, vectorised over time.
+    r"""Retrace(:math:`\lambda`) target of an action value.
 
     From "Safe and efficient off-policy reinforcement learning", Munos et al., 2016
     (https://arxiv.org/abs/1606.02647), in the form of SafeTAC (18):
@@ -31,17 +43,16 @@ def retrace_lambda_return_estimate(
     .. math::
 
         Q^{ret}_t = r_t + \gamma (1 - term_t) V(s_{t+1})
-            + \gamma \lambda (1 - done_t) \rho_{t+1}
-              \left(Q^{ret}_{t+1} - Q(s_{t+1}, a_{t+1})\right),
-        \qquad \rho_t = \min\left(1, \frac{\pi(a_t | s_t)}{\mu(a_t | s_t)}\right).
+            + \gamma (1 - done_t) c_{t+1} \left(Q^{ret}_{t+1} - Q(s_{t+1}, a_{t+1})\right),
+        \qquad c_t = \lambda \min\left(1, \frac{\pi(a_t | s_t)}{\mu(a_t | s_t)}\right).
 
     Every argument is aligned with its own step ``t``; the shift to ``t + 1`` is made within.
     ``done`` cuts the trace and ``terminated`` masks the bootstrap: a truncated step, wherever it
     lies in the batch, bootstraps from its own ``next_state_value`` and never reads the trajectory
     stored after it. The trace ends with the last step.
 
-    ``T`` steps take ``log2(T)`` rounds of tensor operations without a division, so ratios of zero
-    are harmless. The result is differentiable in every floating-point argument.
+    The result is differentiable in every floating-point argument. ``bfloat16`` and ``float16`` are
+    computed in ``float32``, because a discount near 1 is not representable in them.
 
     Args:
         gamma (float or Tensor): discount in [0, 1]. A tensor has one element, or as many
@@ -60,6 +71,8 @@ def retrace_lambda_return_estimate(
         terminated (Tensor, optional): boolean end of episode, ``[*B, T, F]``. Defaults to ``done``.
 
     Keyword Args:
+        vectorized (bool): solve all ``T`` steps in ``log2(T)`` rounds of tensor operations.
+            ``False`` goes back one step at a time, with less memory. Defaults to ``True``.
         time_dim (int): the dimension of time, any but the last. Defaults to ``-2``.
 
     Returns:
@@ -72,7 +85,7 @@ def retrace_lambda_return_estimate(
 
     Examples:
         The second of three steps is truncated. It bootstraps and is worth 2 + 10 / 2; the first
-        adds gamma lmbda rho = .5 * 1 * .25 times that to its own 1 + 10 / 2:
+        adds gamma c = .5 * .25 times that to its own 1 + 10 / 2:
 
         >>> import torch
         >>> reward = torch.tensor([[1.0], [2.0], [4.0]])
@@ -87,37 +100,144 @@ def retrace_lambda_return_estimate(
         tensor([6.8750, 7.0000, 9.0000])
 
     """
-    terminated = done if terminated is None else terminated
-    shape = reward.shape
-    _check_time_dim(time_dim, shape)
-    for name, tensor in (
-        ("action_value", action_value),
-        ("next_state_value", next_state_value),
-        ("done", done),
-        ("terminated", terminated),
-    ):
-        _check_shape(name, tensor, shape, "that of reward")
-    for name, tensor in (("log_pi", log_pi), ("log_mu", log_mu)):
-        _check_shape(name, tensor, (*shape[:-1], 1), "that of reward with one feature")
-    _check_boolean("done", done)
-    _check_boolean("terminated", terminated)
-    gamma = _coefficient("gamma", gamma, shape)
-    lmbda = _coefficient("lmbda", lmbda, shape)
-
-    target = reward + gamma * torch.where(terminated, 0, next_state_value)
-    decay = gamma * lmbda
-    if isinstance(decay, Tensor) and decay.ndim:
-        decay = decay.expand(shape).movedim(time_dim, -1)[..., :-1]
-    log_pi, log_mu, action_value, target, done = (
-        tensor.movedim(time_dim, -1) for tensor in (log_pi, log_mu, action_value, target, done)
+    log_ratio = _log_ratio(log_pi, log_mu, reward).clamp(max=0)
+    return _trace_return_estimate(
+        gamma,
+        lmbda,
+        log_ratio,
+        action_value,
+        next_state_value,
+        reward,
+        done,
+        terminated,
+        vectorized=vectorized,
+        time_dim=time_dim,
     )
-    # Across a cut the ratio is another trajectory's: masking it before the exponential stops its
-    # gradient too, and a NaN in either.
-    log_ratio = torch.where(done[..., :-1], -torch.inf, (log_pi - log_mu)[..., 1:])
-    trace = decay * log_ratio.clamp(max=0).exp()
-    correction = trace * action_value[..., 1:]
-    delta = torch.cat([target[..., :-1] - correction, target[..., -1:]], -1)
-    return _reverse_linear_recurrence(trace, delta).movedim(-1, time_dim)
+
+
+def importance_sampling_lambda_return_estimate(
+    gamma: float | Tensor,
+    lmbda: float | Tensor,
+    log_pi: Tensor,
+    log_mu: Tensor,
+    action_value: Tensor,
+    next_state_value: Tensor,
+    reward: Tensor,
+    done: Tensor,
+    terminated: Tensor | None = None,
+    *,
+    vectorized: bool = True,
+    time_dim: int = -2,
+) -> Tensor:
+    r"""Target with per-decision importance sampling, :math:`c_t = \lambda \pi / \mu`.
+
+    Unbiased at :math:`\lambda = 1` (Munos et al., 2016, table 1), but its variance has no bound.
+    Arguments, result and errors are those of :func:`retrace_lambda_return_estimate`.
+
+    Examples:
+        >>> import torch
+        >>> log_pi, zeros = torch.tensor([[0.0], [3.0]]).log(), torch.zeros(2, 1)
+        >>> importance_sampling_lambda_return_estimate(
+        ...     1.0, 1.0, log_pi, zeros, zeros, zeros, torch.ones(2, 1), zeros.bool()
+        ... ).squeeze(-1)
+        tensor([4., 1.])
+
+    """
+    return _trace_return_estimate(
+        gamma,
+        lmbda,
+        _log_ratio(log_pi, log_mu, reward),
+        action_value,
+        next_state_value,
+        reward,
+        done,
+        terminated,
+        vectorized=vectorized,
+        time_dim=time_dim,
+    )
+
+
+def tree_backup_lambda_return_estimate(
+    gamma: float | Tensor,
+    lmbda: float | Tensor,
+    log_pi: Tensor,
+    action_value: Tensor,
+    next_state_value: Tensor,
+    reward: Tensor,
+    done: Tensor,
+    terminated: Tensor | None = None,
+    *,
+    vectorized: bool = True,
+    time_dim: int = -2,
+) -> Tensor:
+    r"""Tree-Backup(:math:`\lambda`) target of discrete actions, :math:`c_t = \lambda \pi(a_t|s_t)`.
+
+    Needs no behaviour policy (Munos et al., 2016, table 1; Precup et al., 2000). ``log_pi`` is the
+    logarithm of a probability: a density is no trace coefficient. The other arguments, result and
+    errors are those of :func:`retrace_lambda_return_estimate`.
+
+    Examples:
+        >>> import torch
+        >>> log_pi, zeros = torch.tensor([[0.5], [0.5]]).log(), torch.zeros(2, 1)
+        >>> tree_backup_lambda_return_estimate(
+        ...     1.0, 1.0, log_pi, zeros, zeros, torch.ones(2, 1), zeros.bool()
+        ... ).squeeze(-1)
+        tensor([1.5000, 1.0000])
+
+    """
+    return _trace_return_estimate(
+        gamma,
+        lmbda,
+        log_pi,
+        action_value,
+        next_state_value,
+        reward,
+        done,
+        terminated,
+        vectorized=vectorized,
+        time_dim=time_dim,
+    )
+
+
+def q_lambda_return_estimate(
+    gamma: float | Tensor,
+    lmbda: float | Tensor,
+    action_value: Tensor,
+    next_state_value: Tensor,
+    reward: Tensor,
+    done: Tensor,
+    terminated: Tensor | None = None,
+    *,
+    vectorized: bool = True,
+    time_dim: int = -2,
+) -> Tensor:
+    r"""Q(:math:`\lambda`) target with off-policy corrections, :math:`c_t = \lambda`.
+
+    Needs no policy's density (Harutyunyan et al., 2016, https://arxiv.org/abs/1602.04951; Munos et
+    al., 2016, table 1), but is safe only where the two policies are close or :math:`\lambda` is
+    small. The arguments, result and errors are those of :func:`retrace_lambda_return_estimate`.
+
+    Examples:
+        >>> import torch
+        >>> zeros = torch.zeros(2, 1)
+        >>> q_lambda_return_estimate(
+        ...     1.0, 0.5, zeros, zeros, torch.ones(2, 1), zeros.bool()
+        ... ).squeeze(-1)
+        tensor([1.5000, 1.0000])
+
+    """
+    return _trace_return_estimate(
+        gamma,
+        lmbda,
+        torch.zeros_like(reward[..., :1]),
+        action_value,
+        next_state_value,
+        reward,
+        done,
+        terminated,
+        vectorized=vectorized,
+        time_dim=time_dim,
+    )
 
 
 def retrace_variance_reward(
@@ -243,27 +363,99 @@ def _one_step_cost(
     return cost + gamma * torch.where(terminated, 0, next_action_value)
 
 
-def _reverse_linear_recurrence(coefficient: Tensor, delta: Tensor) -> Tensor:
+def _log_ratio(log_pi: Tensor, log_mu: Tensor, reward: Tensor) -> Tensor:
+    for name, tensor in (("log_pi", log_pi), ("log_mu", log_mu)):
+        _check_shape(name, tensor, (*reward.shape[:-1], 1), "that of reward with one feature")
+    return log_pi - log_mu
+
+
+def _trace_return_estimate(
+    gamma: float | Tensor,
+    lmbda: float | Tensor,
+    log_trace: Tensor,
+    action_value: Tensor,
+    next_state_value: Tensor,
+    reward: Tensor,
+    done: Tensor,
+    terminated: Tensor | None,
+    *,
+    vectorized: bool,
+    time_dim: int,
+) -> Tensor:
+    """The recursion of all targets; the trace coefficient is ``lmbda * exp(log_trace)``."""
+    terminated = done if terminated is None else terminated
+    shape = reward.shape
+    if not -len(shape) <= time_dim < len(shape) - 1 or time_dim == -1:
+        raise ValueError(
+            f"time_dim must be a dimension of reward other than its last, of features; got "
+            f"time_dim={time_dim} for shape {tuple(shape)}."
+        )
+    _check_shape("action_value", action_value, shape, "that of reward")
+    _check_shape("next_state_value", next_state_value, shape, "that of reward")
+    _check_shape("done", done, shape, "that of reward")
+    _check_shape("terminated", terminated, shape, "that of reward")
+    _check_shape("log_pi", log_trace, (*shape[:-1], 1), "that of reward with one feature")
+    _check_boolean("done", done)
+    _check_boolean("terminated", terminated)
+    gamma = _coefficient("gamma", gamma, shape)
+    lmbda = _coefficient("lmbda", lmbda, shape)
+
+    dtype = reward.dtype
+    if dtype in (torch.bfloat16, torch.float16):
+        log_trace, action_value, next_state_value, reward = (
+            tensor.float() for tensor in (log_trace, action_value, next_state_value, reward)
+        )
+    target = reward + gamma * torch.where(terminated, 0, next_state_value)
+    decay = gamma * lmbda
+    if isinstance(decay, Tensor) and decay.ndim:
+        decay = decay.expand(shape).movedim(time_dim, -1)[..., :-1]
+    log_trace, action_value, target, done = (
+        tensor.movedim(time_dim, -1) for tensor in (log_trace, action_value, target, done)
+    )
+    # Across a cut the ratio is another trajectory's: masking it before the exponential stops its
+    # gradient too, and a NaN in either.
+    trace = torch.where(done[..., :-1], -torch.inf, log_trace[..., 1:]).exp() * decay
+    head = torch.addcmul(target[..., :-1], trace, action_value[..., 1:], value=-1)
+    delta = torch.cat([head, target[..., -1:]], -1)
+    solve = _solve_recurrence if vectorized else _loop_recurrence
+    return solve(trace, delta).movedim(-1, time_dim).to(dtype)
+
+
+def _solve_recurrence(coefficient: Tensor, delta: Tensor) -> Tensor:
     """Solve ``x[t] = delta[t] + coefficient[t] * x[t + 1]``, ``x[T - 1] = delta[T - 1]``.
 
     By doubling: after each round ``delta[t]`` sums twice as many steps, and ``coefficient[t]`` is
-    the product of as many coefficients. Those whose window would pass the end are dropped.
+    the product of as many coefficients. There is no division, so coefficients of zero are harmless.
+    Zeros behind the last step spare every round a special case for its end.
 
     Args:
-        coefficient (Tensor): ``[..., T - 1]``, broadcasting with ``delta``.
+        coefficient (Tensor): ``[..., T - 1]``.
         delta (Tensor): ``[..., T]``.
 
     Returns:
         Tensor: ``x``, ``[..., T]``.
 
     """
-    stride = 1
-    while stride < delta.shape[-1]:
-        head = torch.addcmul(delta[..., :-stride], coefficient, delta[..., stride:])
-        delta = torch.cat([head, delta[..., -stride:]], -1)
-        coefficient = coefficient[..., :-stride] * coefficient[..., stride:]
-        stride *= 2
+    steps = delta.shape[-1]
+    rounds = (steps - 1).bit_length()
+    length = steps - 1 + 2**rounds
+    coefficient = torch.nn.functional.pad(coefficient, (0, length - steps + 1))
+    delta = torch.nn.functional.pad(delta, (0, length - steps))
+    for stride in (2**i for i in range(rounds)):
+        length -= stride
+        head = coefficient.narrow(-1, 0, length)
+        delta = torch.addcmul(delta.narrow(-1, 0, length), head, delta.narrow(-1, stride, length))
+        coefficient = head * coefficient.narrow(-1, stride, length)
     return delta
+
+
+def _loop_recurrence(coefficient: Tensor, delta: Tensor) -> Tensor:
+    """The same, one step after the other."""
+    *head, last = delta.unbind(-1)
+    solution = [last]
+    for factor, term in zip(reversed(coefficient.unbind(-1)), reversed(head), strict=True):
+        solution.append(torch.addcmul(term, factor, solution[-1]))
+    return torch.stack(solution[::-1], -1)
 
 
 def _coefficient(name: str, value: float | Tensor, shape: Sequence[int]) -> float | Tensor:
@@ -281,15 +473,6 @@ def _coefficient(name: str, value: float | Tensor, shape: Sequence[int]) -> floa
             f"{tuple(shape)} with as many dimensions, got a tensor of shape {tuple(value.shape)}."
         )
     return value
-
-
-def _check_time_dim(time_dim: int, shape: Sequence[int]) -> None:
-    ndim = len(shape)
-    if not (-ndim <= time_dim < ndim - 1 and time_dim != -1):
-        raise ValueError(
-            f"time_dim must be a dimension of reward other than its last, of features; got "
-            f"time_dim={time_dim} for shape {tuple(shape)}."
-        )
 
 
 def _check_shape(name: str, tensor: Tensor, expected: Sequence[int], origin: str) -> None:

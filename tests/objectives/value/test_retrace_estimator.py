@@ -4,21 +4,34 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable
+from contextlib import nullcontext
 
 import pytest
 import torch
 from tensordict import TensorDict, TensorDictBase
-from tensordict.nn import NormalParamExtractor, TensorDictModule
+from tensordict.nn import NormalParamExtractor, TensorDictModule, set_skip_existing
 from torch import Tensor, nn
 from torchrl.data import (
     Bounded,
+    Categorical,
     LazyTensorStorage,
+    OneHot,
     SliceSampler,
     TensorDictReplayBuffer,
 )
-from torchrl.modules import MLP, ProbabilisticActor, TanhNormal, ValueOperator
-from torchrl.objectives import DDPGLoss, DQNLoss, LossModule, SACLoss, SoftUpdate, TD3Loss
-from torchrl.objectives.value import TD0Estimator
+from torchrl.modules import MLP, OneHotCategorical, ProbabilisticActor, TanhNormal, ValueOperator
+from torchrl.objectives import (
+    DDPGLoss,
+    DiscreteIQLLoss,
+    DiscreteSACLoss,
+    DQNLoss,
+    IQLLoss,
+    LossModule,
+    SACLoss,
+    SoftUpdate,
+    TD3Loss,
+)
+from torchrl.objectives.value import TD0Estimator, TDLambdaEstimator
 
 from torchrl_safe.objectives.value import RetraceEstimator, retrace_lambda_return_estimate
 
@@ -121,7 +134,7 @@ def test_log_densities_with_a_feature_dimension() -> None:
 def test_networks_compute_what_is_missing() -> None:
     actor, critic, data = make_actor(), make_critic(), make_data(4, 7)
     estimator = RetraceEstimator(
-        gamma=GAMMA, lmbda=LMBDA, actor_network=actor, value_network=critic
+        gamma=GAMMA, lmbda=LMBDA, actor_network=actor, qvalue_network=critic
     )
     keys = set(data.keys(True, True))
     torch.manual_seed(1)
@@ -144,30 +157,39 @@ def test_networks_compute_what_is_missing() -> None:
     assert not out["value_target"].requires_grad
 
 
-@pytest.mark.parametrize("reads", [None, True])
-def test_existing_entries_win(reads: bool | None) -> None:
+@pytest.mark.parametrize("how", ["argument", "context", "no network"])
+def test_existing_entries_are_used(how: str) -> None:
     data = make_precomputed(4, 7)
-    actor, critic = make_actor(), make_critic()
-    actor.module[0].module, critic.module = Forbidden(), Forbidden()
+    networks = {}
+    if how != "no network":
+        actor, critic = make_actor(), make_critic()
+        actor.module[0].module, critic.module = Forbidden(), Forbidden()
+        networks = {"actor_network": actor, "qvalue_network": critic}
     estimator = RetraceEstimator(
-        gamma=GAMMA, lmbda=LMBDA, actor_network=actor, value_network=critic, skip_existing=reads
+        gamma=GAMMA, lmbda=LMBDA, **networks, skip_existing=True if how == "argument" else None
     )
-    torch.testing.assert_close(estimator.value_estimate(data), reference(data))
+    with set_skip_existing(True) if how == "context" else nullcontext():
+        torch.testing.assert_close(estimator.value_estimate(data), reference(data))
+        torch.testing.assert_close(estimator(data)["value_target"], reference(data))
 
 
-def test_skip_existing_false_recomputes() -> None:
+@pytest.mark.parametrize("skip_existing", [None, False])
+def test_networks_win_by_default(skip_existing: bool | None) -> None:
     data = make_precomputed(4, 7)
     settings = {
         "gamma": GAMMA,
         "lmbda": LMBDA,
         "actor_network": make_actor(),
-        "value_network": make_critic(),
+        "qvalue_network": make_critic(),
     }
-    fresh = data.exclude("policy_log_prob", "state_action_value")
-    expected = RetraceEstimator(**settings).value_estimate(fresh)
-    estimator = RetraceEstimator(**settings, skip_existing=False)
-    torch.testing.assert_close(estimator.value_estimate(data), expected)
-    assert not torch.allclose(expected, reference(data))
+    estimator = RetraceEstimator(**settings, skip_existing=skip_existing)
+    fresh = data.exclude("policy_log_prob", "state_action_value", ("next", "state_value"))
+    targets = []
+    for each in (fresh, data):
+        torch.manual_seed(1)
+        targets.append(estimator.value_estimate(each))
+    torch.testing.assert_close(*targets)
+    assert not torch.allclose(targets[0], reference(data))
 
 
 def test_params_and_target_params() -> None:
@@ -175,7 +197,7 @@ def test_params_and_target_params() -> None:
     critics = [make_critic() for _ in range(3)]
     values = [critic(data.copy())["state_action_value"].detach() for critic in critics]
     params = [TensorDict.from_module(critic).detach() for critic in critics]
-    estimator = RetraceEstimator(gamma=GAMMA, lmbda=LMBDA, value_network=make_critic())
+    estimator = RetraceEstimator(gamma=GAMMA, lmbda=LMBDA, qvalue_network=make_critic())
 
     target = reference(data, action_value=values[0])
     torch.testing.assert_close(estimator.value_estimate(data, target_params=params[0]), target)
@@ -202,7 +224,7 @@ def test_chunks(chunks: dict[str, int]) -> None:
     critic = make_critic()
     sizes = []
     critic.register_forward_pre_hook(lambda module, args: sizes.append(args[0].batch_size))
-    settings = {"gamma": GAMMA, "lmbda": LMBDA, "value_network": critic}
+    settings = {"gamma": GAMMA, "lmbda": LMBDA, "qvalue_network": critic}
     expected = RetraceEstimator(**settings).value_estimate(data)
     assert sizes.pop() == (5, 7)
     torch.testing.assert_close(
@@ -213,14 +235,11 @@ def test_chunks(chunks: dict[str, int]) -> None:
     assert sum(size[dim] for size in sizes) == data.shape[dim]
 
 
-def test_value_arguments() -> None:
+def test_next_value_argument() -> None:
     data = make_precomputed(4, 7)
     next_value = torch.randn(4, 7, 1)
     target = RetraceEstimator(gamma=GAMMA, lmbda=LMBDA).value_estimate(data, next_value=next_value)
     torch.testing.assert_close(target, reference(data, next_state_value=next_value))
-    value = torch.randn(4, 7, 1)
-    target = RetraceEstimator(gamma=GAMMA, lmbda=LMBDA).value_estimate(data, action_value=value)
-    torch.testing.assert_close(target, reference(data, action_value=value))
 
 
 def test_missing_terminated_is_done() -> None:
@@ -303,7 +322,7 @@ def test_nested_keys_of_networks() -> None:
     actor = make_actor(observation, action)
     critic = make_critic(observation, action, out_keys=[("agent", "q")])
     estimator = RetraceEstimator(
-        gamma=GAMMA, lmbda=LMBDA, actor_network=actor, value_network=critic
+        gamma=GAMMA, lmbda=LMBDA, actor_network=actor, qvalue_network=critic
     )
     estimator.set_keys(state_action_value=("agent", "q"))
     assert estimator.tensor_keys.action == action
@@ -315,10 +334,10 @@ def test_nested_keys_of_networks() -> None:
     nested["agent", "act_log_prob"] = data["action_log_prob"]
 
     plain = RetraceEstimator(
-        gamma=GAMMA, lmbda=LMBDA, actor_network=make_actor(), value_network=make_critic()
+        gamma=GAMMA, lmbda=LMBDA, actor_network=make_actor(), qvalue_network=make_critic()
     )
     plain.actor_network.load_state_dict(actor.state_dict())
-    plain.value_network.load_state_dict(critic.state_dict())
+    plain.qvalue_network.load_state_dict(critic.state_dict())
     targets = []
     for each, inputs in ((plain, data), (estimator, nested)):
         torch.manual_seed(1)
@@ -331,16 +350,17 @@ def test_set_keys_rejects() -> None:
     before = estimator.tensor_keys
     with pytest.raises(KeyError, match="cost is not an accepted tensordict key"):
         estimator.set_keys(reward="r", cost="c")
-    for key in (None, 3):
-        with pytest.raises(ValueError, match="must be a string or a tuple"):
-            estimator.set_keys(reward=key)
+    with pytest.raises(ValueError, match="tensordict keys cannot be None"):
+        estimator.set_keys(reward=None)
+    with pytest.raises(ValueError, match="key name must be of type NestedKey"):
+        estimator.set_keys(reward=3)
     assert estimator.tensor_keys == before
 
 
 def test_dispatch() -> None:
     data = make_data(4, 7)
     estimator = RetraceEstimator(
-        gamma=GAMMA, lmbda=LMBDA, actor_network=make_actor(), value_network=make_critic()
+        gamma=GAMMA, lmbda=LMBDA, actor_network=make_actor(), qvalue_network=make_critic()
     )
     torch.manual_seed(1)
     expected = estimator(data.copy())
@@ -358,7 +378,7 @@ def test_dispatch() -> None:
 def test_one_call_of_the_critic_per_state() -> None:
     data, critic, calls = make_precomputed(4, 7), make_critic(), []
     critic.register_forward_hook(lambda *args: calls.append(args))
-    RetraceEstimator(gamma=GAMMA, lmbda=LMBDA, value_network=critic)(
+    RetraceEstimator(gamma=GAMMA, lmbda=LMBDA, qvalue_network=critic)(
         data.exclude("state_action_value")
     )
     assert len(calls) == 1
@@ -366,7 +386,7 @@ def test_one_call_of_the_critic_per_state() -> None:
 
 def test_in_keys_suffice() -> None:
     data = make_precomputed(4, 7)
-    networks = {"actor_network": make_actor(), "value_network": make_critic()}
+    networks = {"actor_network": make_actor(), "qvalue_network": make_critic()}
     for chosen in ({}, {"actor_network": networks["actor_network"]}, networks):
         estimator = RetraceEstimator(gamma=GAMMA, lmbda=LMBDA, **chosen)
         estimator(data.select(*estimator.in_keys))
@@ -392,7 +412,7 @@ def test_networks_get_no_gradient() -> None:
     data, actor, critic = make_data(4, 7), make_actor(), make_critic()
     data["next", "reward"].requires_grad_()
     estimator = RetraceEstimator(
-        gamma=GAMMA, lmbda=LMBDA, actor_network=actor, value_network=critic, differentiable=True
+        gamma=GAMMA, lmbda=LMBDA, actor_network=actor, qvalue_network=critic, differentiable=True
     )
     estimator(data)["advantage"].sum().backward()
     assert all(p.grad is None for net in (actor, critic) for p in net.parameters())
@@ -409,7 +429,7 @@ def test_average_rewards() -> None:
 def test_settings_are_not_state() -> None:
     actor, critic = make_actor(), make_critic()
     estimator = RetraceEstimator(
-        gamma=torch.tensor([0.5]), lmbda=1, actor_network=actor, value_network=critic
+        gamma=torch.tensor([0.5]), lmbda=1, actor_network=actor, qvalue_network=critic
     )
     assert not estimator.state_dict()
     assert not list(estimator.parameters())
@@ -454,7 +474,7 @@ def test_missing_entries(key: str | tuple[str, str]) -> None:
 def test_missing_inputs_of_networks(key: str | tuple[str, str]) -> None:
     data = make_data(4, 7).exclude(key)
     estimator = RetraceEstimator(
-        gamma=GAMMA, lmbda=LMBDA, actor_network=make_actor(), value_network=make_critic()
+        gamma=GAMMA, lmbda=LMBDA, actor_network=make_actor(), qvalue_network=make_critic()
     )
     with pytest.raises(KeyError, match=key if isinstance(key, str) else key[-1]):
         estimator(data)
@@ -462,7 +482,7 @@ def test_missing_inputs_of_networks(key: str | tuple[str, str]) -> None:
 
 def test_critic_that_writes_another_key() -> None:
     critic = make_critic(out_keys=["q"])
-    estimator = RetraceEstimator(gamma=GAMMA, lmbda=LMBDA, value_network=critic)
+    estimator = RetraceEstimator(gamma=GAMMA, lmbda=LMBDA, qvalue_network=critic)
     data = make_precomputed(4, 7).exclude("state_action_value")
     with pytest.raises(KeyError, match="state_action_value"):
         estimator(data)
@@ -473,20 +493,245 @@ def test_bad_data() -> None:
     with pytest.raises(RuntimeError, match="no dimension of time"):
         estimator(make_precomputed(1)[0])
     data = make_precomputed(4, 7)
-    data["steps_to_next_obs"] = torch.full((4, 7, 1), 3)
-    with pytest.raises(ValueError, match="multi-step"):
-        estimator(data)
-    data = make_precomputed(4, 7)
     data["policy_log_prob"] = torch.randn(4, 7, ACT)
     with pytest.raises(ValueError, match="log_pi must have shape"):
         estimator(data)
 
 
-def test_compile() -> None:
+@pytest.mark.parametrize("part", ["value_estimate", "forward"])
+def test_compile(part: str) -> None:
     data = make_precomputed(4, 7)
     estimator = RetraceEstimator(gamma=GAMMA, lmbda=LMBDA)
-    compiled = torch.compile(estimator.value_estimate, backend="eager", fullgraph=True)
-    torch.testing.assert_close(compiled(data), reference(data))
+    expected = estimator(data.copy())["value_target"]
+    if part == "forward":
+        compiled = torch.compile(estimator, backend="eager", fullgraph=True)
+        torch.testing.assert_close(compiled(data)["value_target"], expected)
+    else:
+        compiled = torch.compile(estimator.value_estimate, backend="eager", fullgraph=True)
+        torch.testing.assert_close(compiled(data), expected)
+
+
+def test_vmap() -> None:
+    data = make_precomputed(3, 4, 7)
+    estimator = RetraceEstimator(gamma=GAMMA, lmbda=LMBDA)
+    target = torch.vmap(estimator.value_estimate)(data)
+    torch.testing.assert_close(target, reference(data))
+
+
+def test_vectorized() -> None:
+    data = make_precomputed(4, 7)
+    target = RetraceEstimator(gamma=GAMMA, lmbda=LMBDA, vectorized=False).value_estimate(data)
+    torch.testing.assert_close(target, reference(data))
+
+
+def test_bfloat16() -> None:
+    data = make_precomputed(4, 50)
+    half = data.apply(lambda x: x.bfloat16() if x.is_floating_point() else x)
+    target = RetraceEstimator(gamma=GAMMA, lmbda=LMBDA).value_estimate(half)
+    assert target.dtype == torch.bfloat16
+    torch.testing.assert_close(target.float(), reference(data), rtol=0.02, atol=0.05)
+
+
+def test_group_key() -> None:
+    """Rewards of one task on another scale do not weigh more."""
+    data = make_precomputed(4, 7)
+    data["task"] = torch.tensor([[3], [1], [3], [1]]).expand(4, 7)
+    data["next", "reward"][::2] *= 100
+    estimator = RetraceEstimator(gamma=GAMMA, lmbda=LMBDA, average_rewards=True, group_key="task")
+    assert "task" in estimator.in_keys
+    target = estimator.value_estimate(data)
+    reward = data["next", "reward"].clone()
+    for rows in (slice(0, None, 2), slice(1, None, 2)):
+        reward[rows] = (reward[rows] - reward[rows].mean()) / reward[rows].std()
+    data["next", "reward"] = reward
+    torch.testing.assert_close(target, reference(data), rtol=1e-4, atol=1e-4)
+    with pytest.raises(KeyError, match="group_key 'task' is missing"):
+        estimator.value_estimate(data.exclude("task"))
+
+
+def test_steps_to_next_obs() -> None:
+    """The discount of n-step transitions; on-policy, where Q(s, a) = V(s), they are TD(lambda)."""
+    data = make_precomputed(4, 7)
+    steps = torch.randint(1, 4, (4, 7, 1))
+    expected = reference(data, gamma=torch.tensor(GAMMA) ** steps)
+    data["steps_to_next_obs"] = steps
+    target = RetraceEstimator(gamma=GAMMA, lmbda=LMBDA).value_estimate(data)
+    torch.testing.assert_close(target, expected)
+
+    data["action_log_prob"] = data["policy_log_prob"]
+    follows = ~data["next", "done"][:, :-1]
+    next_value = data["next", "state_value"]
+    next_value[:, :-1] = torch.where(follows, data["state_action_value"][:, 1:], next_value[:, :-1])
+    expected = TDLambdaEstimator(
+        gamma=GAMMA, lmbda=LMBDA, value_network=None, vectorized=False
+    ).value_estimate(data, next_value=next_value)
+    target = RetraceEstimator(gamma=GAMMA, lmbda=LMBDA).value_estimate(data)
+    torch.testing.assert_close(target, expected)
+
+
+def test_value_network() -> None:
+    data = make_precomputed(4, 7)
+    values = [ValueOperator(MLP(OBS, 1, num_cells=[8]), in_keys=["observation"]) for _ in range(2)]
+    estimator = RetraceEstimator(gamma=GAMMA, lmbda=LMBDA, value_network=values[0])
+    next_values = [value.module(data["next", "observation"]).detach() for value in values]
+    expected = [reference(data, next_state_value=value) for value in next_values]
+    torch.testing.assert_close(estimator.value_estimate(data), expected[0])
+    torch.testing.assert_close(estimator(data.copy())["value_target"], expected[0])
+    params = TensorDict.from_module(values[1]).detach()
+    torch.testing.assert_close(estimator.value_estimate(data, params), expected[1])
+    out = estimator(data.copy(), target_params=params)
+    torch.testing.assert_close(out["value_target"], expected[1])
+
+
+def test_num_next_actions() -> None:
+    data, actor, critic = make_data(4, 7), make_actor(), make_critic()
+    settings = {"gamma": GAMMA, "lmbda": 0.0, "actor_network": actor, "qvalue_network": critic}
+    torch.manual_seed(1)
+    target = RetraceEstimator(**settings, num_next_actions=3).value_estimate(data)
+    torch.manual_seed(1)
+    dist = actor.get_dist(data["next"])
+    observation = data["next", "observation"]
+    values = [critic.module(observation, dist.sample()).detach() for _ in range(3)]
+    mean = sum(values) / 3 * ~data["next", "terminated"]
+    torch.testing.assert_close(target, data["next", "reward"] + GAMMA * mean)
+    with pytest.raises(ValueError, match="num_next_actions must be at least 1, got 0"):
+        RetraceEstimator(**settings, num_next_actions=0)
+
+
+def make_shifted_data(truncations: int) -> TensorDict:
+    """One rollout of 8 steps: a step's next observation is the following step's."""
+    data = make_data(8)
+    done = torch.zeros(8, 1, dtype=torch.bool)
+    done[[2, 4][:truncations]] = True
+    data["next"].update({"done": done, "terminated": torch.zeros_like(done)})
+    follows = ~done[:-1]
+    data["next", "observation"][:-1] = torch.where(
+        follows, data["observation"][1:], data["next", "observation"][:-1]
+    )
+    return data
+
+
+class StateCritic(nn.Module):
+    """A critic that ignores the action: its targets do not depend on the draws."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.net = MLP(OBS, 1, num_cells=[8])
+
+    def forward(self, observation: Tensor, action: Tensor) -> Tensor:
+        return self.net(observation)
+
+
+@pytest.mark.parametrize(("truncations", "budget", "kept"), [(0, 1, 8), (2, 3, 8), (2, 1, 6)])
+def test_shifted(truncations: int, budget: int, kept: int) -> None:
+    data, actor = make_shifted_data(truncations), make_actor()
+    critic = ValueOperator(StateCritic(), in_keys=["observation", "action"])
+    actor_states = []
+    actor.module[0].register_forward_pre_hook(
+        lambda module, args: actor_states.append(args[0].shape[0])
+    )
+    settings = {"gamma": GAMMA, "lmbda": LMBDA, "actor_network": actor, "qvalue_network": critic}
+    expected = RetraceEstimator(**settings)(data.copy())
+    assert sum(actor_states) == 16
+    actor_states.clear()
+    estimator = RetraceEstimator(**settings, shifted=True, shifted_budget=budget)
+    out = estimator(data.copy())
+    assert sum(actor_states) == 8 + budget
+    assert out["shifted_valid"].sum() == kept
+    assert out["shifted_valid"][:kept].all()
+    if kept == 8:
+        torch.testing.assert_close(out["value_target"], expected["value_target"])
+        torch.testing.assert_close(out["advantage"], expected["advantage"])
+    else:
+        # What fits is a shorter slice: its last step bootstraps, and no trace comes from beyond.
+        short = RetraceEstimator(**settings)(data[:kept].copy())
+        torch.testing.assert_close(out["value_target"][:kept], short["value_target"])
+        assert not out["value_target"][kept:].any()
+
+
+def test_shifted_misuse() -> None:
+    data = make_shifted_data(0)
+    critic = make_critic()
+    networks = {"actor_network": make_actor(), "qvalue_network": critic}
+    with pytest.raises(ValueError, match="shifted=True needs actor_network and qvalue_network"):
+        RetraceEstimator(gamma=GAMMA, lmbda=LMBDA, qvalue_network=critic, shifted=True)(data)
+    estimator = RetraceEstimator(gamma=GAMMA, lmbda=LMBDA, **networks, shifted=True)
+    with pytest.raises(ValueError, match="leave out target_params"):
+        estimator(data, target_params=TensorDict.from_module(critic))
+    with pytest.raises(ValueError, match="shifted must be a boolean"):
+        RetraceEstimator(gamma=GAMMA, lmbda=LMBDA, shifted="yes")
+
+
+# Discrete actions -------------------------------------------------------------------------------
+
+NUM_ACTIONS = 4
+
+
+def make_discrete(action_space: str, out_key: str = "action_value"):
+    one_hot = action_space == "one-hot"
+    actor = ProbabilisticActor(
+        TensorDictModule(
+            MLP(OBS, NUM_ACTIONS, num_cells=[8]), in_keys=["observation"], out_keys=["logits"]
+        ),
+        in_keys=["logits"],
+        distribution_class=OneHotCategorical if one_hot else torch.distributions.Categorical,
+        return_log_prob=True,
+    )
+    critic = TensorDictModule(
+        MLP(OBS, NUM_ACTIONS, num_cells=[8]), in_keys=["observation"], out_keys=[out_key]
+    )
+    return actor, critic
+
+
+def make_discrete_data(action_space: str, *batch: int) -> tuple[TensorDict, Tensor]:
+    data = make_data(*batch)
+    index = torch.randint(NUM_ACTIONS, batch)
+    one_hot = torch.nn.functional.one_hot(index, NUM_ACTIONS)
+    data["action"] = one_hot if action_space == "one-hot" else index
+    return data, index
+
+
+@pytest.mark.parametrize("how", ["name", "spec"])
+@pytest.mark.parametrize("shifted", [False, True])
+@pytest.mark.parametrize("action_space", ["one-hot", "categorical"])
+def test_discrete_actions(action_space: str, shifted: bool, how: str) -> None:
+    """The expectation over next actions is exact."""
+    actor, critic = make_discrete(action_space)
+    data, index = make_discrete_data(action_space, 8)
+    shifted_data = make_shifted_data(0)
+    data["next"].update(shifted_data["next"])
+    data["observation"] = shifted_data["observation"]
+    specs = {"one-hot": OneHot(NUM_ACTIONS), "categorical": Categorical(NUM_ACTIONS)}
+    estimator = RetraceEstimator(
+        gamma=GAMMA,
+        lmbda=LMBDA,
+        actor_network=actor,
+        qvalue_network=critic,
+        action_space=action_space if how == "name" else specs[action_space],
+        shifted=shifted,
+    )
+    with torch.no_grad():
+        logits = actor.module[0].module(data["observation"]).log_softmax(-1)
+        next_prob = actor.module[0].module(data["next", "observation"]).softmax(-1)
+        next_values = critic.module(data["next", "observation"])
+        value = critic.module(data["observation"]).gather(-1, index[:, None])
+        expected = reference(
+            data,
+            log_pi=logits.gather(-1, index[:, None]),
+            action_value=value,
+            next_state_value=(next_prob * next_values).sum(-1, keepdim=True),
+        )
+    out = estimator(data.copy())
+    torch.testing.assert_close(out["value_target"], expected, rtol=1e-4, atol=1e-5)
+    torch.testing.assert_close(out["advantage"], expected - value, rtol=1e-4, atol=1e-5)
+    if not shifted:
+        torch.testing.assert_close(estimator.value_estimate(data), out["value_target"])
+
+
+@pytest.mark.parametrize("action_space", ["binary", Bounded(-1, 1, (2,))])
+def test_other_action_spaces(action_space: object) -> None:
+    with pytest.raises(ValueError, match="action_space must be 'one-hot', 'categorical'"):
+        RetraceEstimator(gamma=GAMMA, lmbda=LMBDA, action_space=action_space)
 
 
 # In a loss --------------------------------------------------------------------------------------
@@ -519,15 +764,59 @@ def make_sac_v1() -> SACLoss:
 
 def with_retrace(loss: LossModule, **kwargs) -> LossModule:
     settings = {"gamma": GAMMA, "lmbda": LMBDA, **kwargs}
-    return loss.make_value_estimator(RetraceEstimator.for_loss(loss, **settings))
+    loss.make_value_estimator(RetraceEstimator.for_loss(loss, **settings))
+    if isinstance(loss, IQLLoss):
+        loss.value_estimator.set_keys(sample_log_prob=("next", "action_log_prob"))
+    return loss
 
 
-LOSSES = [make_sac, make_td3, make_ddpg, make_sac_v1]
+def make_iql() -> IQLLoss:
+    value = ValueOperator(MLP(OBS, 1, num_cells=[8]), in_keys=["observation"])
+    loss = IQLLoss(make_actor(), make_critic(), value)
+    SoftUpdate(loss, eps=0.5)
+    return loss
+
+
+def make_discrete_sac() -> DiscreteSACLoss:
+    loss = DiscreteSACLoss(
+        *make_discrete("categorical"), action_space="categorical", num_actions=NUM_ACTIONS
+    )
+    SoftUpdate(loss, eps=0.5)
+    return loss
+
+
+def make_discrete_iql() -> DiscreteIQLLoss:
+    value = ValueOperator(MLP(OBS, 1, num_cells=[8]), in_keys=["observation"])
+    actor, critic = make_discrete("categorical", "state_action_value")
+    loss = DiscreteIQLLoss(actor, critic, value, action_space="categorical")
+    SoftUpdate(loss, eps=0.5)
+    return loss
+
+
+def make_loss_data(make_loss: Callable[[], LossModule], *batch: int) -> TensorDict:
+    data = make_data(*batch)
+    if "discrete" in make_loss.__name__:
+        data, _ = make_discrete_data("categorical", *batch)
+    if "iql" in make_loss.__name__:
+        # IQLLoss hands its estimator "next", the actor's inputs and the action, nothing else.
+        data["next", "action_log_prob"] = data["action_log_prob"]
+    return data
+
+
+LOSSES = [
+    make_sac,
+    make_td3,
+    make_ddpg,
+    make_sac_v1,
+    make_iql,
+    make_discrete_sac,
+    make_discrete_iql,
+]
 
 
 @pytest.mark.parametrize("make_loss", LOSSES)
 def test_lambda_zero_is_the_loss_with_td0(make_loss: Callable[[], LossModule]) -> None:
-    loss, data = make_loss(), make_data(4, 6)
+    loss, data = make_loss(), make_loss_data(make_loss, 4, 6)
     outputs = []
     for prepare in (
         lambda: loss.make_value_estimator(gamma=GAMMA),
@@ -548,7 +837,7 @@ def test_parameters_and_state_of_the_loss(make_loss: Callable[[], LossModule]) -
     loss = make_loss()
     parameters, state, modules = dict(loss.named_parameters()), loss.state_dict(), {*loss.modules()}
     with_retrace(loss)
-    loss(make_data(4, 6))
+    loss(make_loss_data(make_loss, 4, 6))
     assert loss.state_dict().keys() == state.keys()
     after = dict(loss.named_parameters())
     assert after.keys() == parameters.keys()

@@ -12,7 +12,13 @@ from torchrl.objectives.value.functional import (
     vec_td_lambda_return_estimate,
 )
 
-from torchrl_safe.objectives.value import retrace_lambda_return_estimate, retrace_variance_reward
+from torchrl_safe.objectives.value import (
+    importance_sampling_lambda_return_estimate,
+    q_lambda_return_estimate,
+    retrace_lambda_return_estimate,
+    retrace_variance_reward,
+    tree_backup_lambda_return_estimate,
+)
 
 GAMMA, LMBDA = 0.95, 0.9
 NAMES = (
@@ -47,8 +53,32 @@ def make_inputs(
     }
 
 
-def by_definition(gamma, lmbda, log_pi, log_mu, q, next_value, reward, done, terminated) -> Tensor:
-    """Q + sum over s >= t of gamma^(s-t) (prod of lmbda rho up to s) (TD error of s), in floats."""
+# Munos et al., 2016, table 1: the trace coefficient from lambda and the two probabilities.
+COEFFICIENTS = {
+    retrace_lambda_return_estimate: lambda lmbda, pi, mu: lmbda * min(1.0, pi / mu),
+    importance_sampling_lambda_return_estimate: lambda lmbda, pi, mu: lmbda * pi / mu,
+    tree_backup_lambda_return_estimate: lambda lmbda, pi, mu: lmbda * pi,
+    q_lambda_return_estimate: lambda lmbda, pi, mu: lmbda,
+}
+IGNORED = {
+    tree_backup_lambda_return_estimate: ["log_mu"],
+    q_lambda_return_estimate: ["log_pi", "log_mu"],
+}
+
+
+def by_definition(
+    gamma,
+    lmbda,
+    log_pi,
+    log_mu,
+    q,
+    next_value,
+    reward,
+    done,
+    terminated,
+    coefficient=COEFFICIENTS[retrace_lambda_return_estimate],
+) -> Tensor:
+    """Q + sum over s >= t of gamma^(s-t) (prod of c up to s) (TD error of s), in floats."""
     target = torch.empty_like(reward)
     *batch, steps, features = reward.shape
     gamma = torch.as_tensor(gamma, dtype=torch.float64).expand(reward.shape)
@@ -57,13 +87,16 @@ def by_definition(gamma, lmbda, log_pi, log_mu, q, next_value, reward, done, ter
     ):
         *b, f = index.tolist()
         at = [(*b, t, f) for t in range(steps)]
-        ratio = [math.exp((log_pi - log_mu)[(*b, t, 0)].item()) for t in range(steps)]
+        pi, mu = (
+            [math.exp(log_prob[(*b, t, 0)].item()) for t in range(steps)]
+            for log_prob in (log_pi, log_mu)
+        )
         for t in range(steps):
             total = q[at[t]].item()
             for s in range(t, steps):
                 weight = 1.0
                 for i in range(t + 1, s + 1):
-                    weight *= gamma[at[i - 1]].item() * lmbda * min(1.0, ratio[i])
+                    weight *= gamma[at[i - 1]].item() * coefficient(lmbda, pi[i], mu[i])
                 bootstrap = 0.0 if terminated[at[s]] else next_value[at[s]].item()
                 error = reward[at[s]] + gamma[at[s]] * bootstrap - q[at[s]]
                 total += weight * error.item()
@@ -73,12 +106,62 @@ def by_definition(gamma, lmbda, log_pi, log_mu, q, next_value, reward, done, ter
     return target
 
 
+@pytest.mark.parametrize("vectorized", [True, False])
 @pytest.mark.parametrize("steps", [1, 2, 3, 8, 13, 32])
 @pytest.mark.parametrize(("batch", "features"), [((), 1), ((3,), 1), ((2, 2), 3)])
-def test_definition(batch: tuple[int, ...], steps: int, features: int) -> None:
+def test_definition(batch: tuple[int, ...], features: int, steps: int, vectorized: bool) -> None:
     inputs = make_inputs(*batch, steps=steps, features=features, seed=steps)
-    target = retrace_lambda_return_estimate(GAMMA, LMBDA, **inputs)
+    target = retrace_lambda_return_estimate(GAMMA, LMBDA, **inputs, vectorized=vectorized)
     torch.testing.assert_close(target, by_definition(GAMMA, LMBDA, *inputs.values()))
+
+
+@pytest.mark.parametrize("lmbda", [0.0, 0.6, 1.0])
+@pytest.mark.parametrize("vectorized", [True, False])
+@pytest.mark.parametrize("estimate", COEFFICIENTS, ids=lambda estimate: estimate.__name__)
+def test_trace_coefficients(estimate, vectorized: bool, lmbda: float) -> None:
+    inputs = make_inputs(3, steps=9, features=2)
+    inputs["log_pi"] = inputs["log_pi"].sigmoid().log()  # probabilities, for Tree-Backup
+    expected = by_definition(GAMMA, lmbda, *inputs.values(), coefficient=COEFFICIENTS[estimate])
+    needed = {name: x for name, x in inputs.items() if name not in IGNORED.get(estimate, [])}
+    target = estimate(GAMMA, lmbda, **needed, vectorized=vectorized)
+    torch.testing.assert_close(target, expected)
+    moved = {name: x.transpose(0, 1) for name, x in needed.items()}
+    target = estimate(GAMMA, lmbda, **moved, vectorized=vectorized, time_dim=0)
+    torch.testing.assert_close(target, expected.transpose(0, 1))
+
+
+@pytest.mark.parametrize("estimate", COEFFICIENTS, ids=lambda estimate: estimate.__name__)
+def test_expected_targets_are_exact(estimate) -> None:
+    """Off-policy, the exact action values of an MDP are their own expected targets."""
+    mdp = RandomMDP(0)
+    value = mdp._with_terminal(mdp.mean[:-1], 1e3)
+    target = mdp.expected_target(mdp.gamma, 0.7, value, mdp.stored_cost(), estimate)
+    torch.testing.assert_close(target, mdp.mean[:-1].flatten())
+
+
+def test_importance_sampling_is_monte_carlo() -> None:
+    """At lambda = 1 no value counts but the last: the weighted return has the right mean."""
+    mdp = RandomMDP(1)
+    wrong = torch.rand_like(mdp.mean)
+    states = mdp.successor[:, -1, 0]
+    bootstrap = mdp._with_terminal(mdp.mean[:-1])[states, mdp.bootstrap[:, -1, 0]]
+    next_value = wrong[mdp.successor, mdp.bootstrap]
+    next_value[:, -1, 0] = bootstrap
+    # The mean over next actions is exact, so that the wrong values cancel step by step.
+    next_value[:, :-1] = (mdp.pi * wrong).sum(-1)[mdp.successor[:, :-1]]
+    target = importance_sampling_lambda_return_estimate(
+        mdp.gamma,
+        1.0,
+        mdp.pi.log()[mdp.state, mdp.action],
+        mdp.mu.log()[mdp.state, mdp.action],
+        wrong[mdp.state, mdp.action],
+        next_value,
+        mdp.stored_cost(),
+        mdp.successor == mdp.num_states,
+    )
+    total = torch.zeros(mdp.num_states * mdp.num_actions, dtype=torch.float64)
+    total.index_add_(0, mdp.start, mdp.probability * target[:, 0, 0])
+    torch.testing.assert_close(total, mdp.mean[:-1].flatten())
 
 
 def test_discount_per_step() -> None:
@@ -226,13 +309,15 @@ def test_coefficient_shape(shape: tuple[int, ...]) -> None:
         retrace_lambda_return_estimate(torch.ones(shape), LMBDA, **make_inputs(2, steps=5))
 
 
-def test_gradient() -> None:
+@pytest.mark.parametrize("vectorized", [True, False])
+def test_gradient(vectorized: bool) -> None:
     inputs = make_inputs(2, steps=6, features=2)
     flags = (inputs.pop("done"), inputs.pop("terminated"))
     coefficients = [torch.tensor(value, dtype=torch.float64) for value in (GAMMA, LMBDA)]
     arguments = [tensor.requires_grad_() for tensor in (*coefficients, *inputs.values())]
     assert torch.autograd.gradcheck(
-        lambda *args: retrace_lambda_return_estimate(*args, *flags), arguments
+        lambda *args: retrace_lambda_return_estimate(*args, *flags, vectorized=vectorized),
+        arguments,
     )
 
 
@@ -271,7 +356,7 @@ def clip(inputs: dict[str, Tensor]) -> dict[str, Tensor]:
 
 
 @pytest.mark.parametrize(
-    ("dtype", "rtol", "atol"), [(torch.float32, 1e-5, 1e-5), (torch.bfloat16, 0.05, 0.2)]
+    ("dtype", "rtol", "atol"), [(torch.float32, 1e-5, 1e-5), (torch.bfloat16, 0.01, 0.02)]
 )
 def test_dtype(dtype: torch.dtype, rtol: float, atol: float) -> None:
     inputs = make_inputs(2, steps=200, dtype=dtype)
@@ -280,6 +365,19 @@ def test_dtype(dtype: torch.dtype, rtol: float, atol: float) -> None:
     assert target.dtype == dtype
     expected = retrace_lambda_return_estimate(GAMMA, LMBDA, **exact)
     torch.testing.assert_close(target.double(), expected, rtol=rtol, atol=atol)
+
+
+@pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16])
+def test_half_precision_is_stable(dtype: torch.dtype) -> None:
+    """A thousand rewards of 1: bfloat16 has no .99, and a running sum in it stops growing."""
+    ones, zeros = torch.ones(1000, 1, dtype=dtype), torch.zeros(1000, 1, dtype=dtype)
+    target = retrace_lambda_return_estimate(
+        0.99, 1.0, zeros, zeros, zeros, zeros, ones, zeros.bool()
+    )
+    assert target.dtype == dtype
+    left = torch.arange(1000, 0, -1, dtype=torch.float64).unsqueeze(-1)
+    exact = (1 - 0.99**left) / 0.01
+    torch.testing.assert_close(target.double(), exact, rtol=2**-8, atol=0)
 
 
 def test_long_undiscounted_trajectory() -> None:
@@ -388,17 +486,27 @@ class RandomMDP:
             torch.stack(column, 1).unsqueeze(-1) for column in zip(*steps, strict=True)
         )
 
-    def expected_target(self, gamma: float, lmbda: float, value: Tensor, reward: Tensor) -> Tensor:
-        """E_mu[first Retrace target | s, a], for a value ``[S + 1, A]``."""
-        target = retrace_lambda_return_estimate(
+    def expected_target(
+        self,
+        gamma: float,
+        lmbda: float,
+        value: Tensor,
+        reward: Tensor,
+        estimate=retrace_lambda_return_estimate,
+    ) -> Tensor:
+        """E_mu[first target | s, a], for a value ``[S + 1, A]``."""
+        densities = {
+            "log_pi": self.pi.log()[self.state, self.action],
+            "log_mu": self.mu.log()[self.state, self.action],
+        }
+        target = estimate(
             gamma,
             lmbda,
-            self.pi.log()[self.state, self.action],
-            self.mu.log()[self.state, self.action],
-            value[self.state, self.action],
-            value[self.successor, self.bootstrap],
-            reward,
-            self.successor == self.num_states,
+            **{n: x for n, x in densities.items() if n not in IGNORED.get(estimate, [])},
+            action_value=value[self.state, self.action],
+            next_state_value=value[self.successor, self.bootstrap],
+            reward=reward,
+            done=self.successor == self.num_states,
         )
         total = torch.zeros(self.num_states * self.num_actions, dtype=torch.float64)
         return total.index_add(0, self.start, self.probability * target[:, 0, 0])

@@ -4,16 +4,22 @@ from __future__ import annotations
 
 from torchrl_safe.objectives.value.advantages import RetraceEstimator
 from torchrl_safe.objectives.value.functional import (
+    importance_sampling_lambda_return_estimate,
+    q_lambda_return_estimate,
     retrace_lambda_return_estimate,
     retrace_variance_reward,
     squared_td_error,
+    tree_backup_lambda_return_estimate,
 )
 from torchrl_safe.objectives.value.policy import with_policy
 
 __all__ = [
     "RetraceEstimator",
+    "importance_sampling_lambda_return_estimate",
+    "q_lambda_return_estimate",
     "retrace_lambda_return_estimate",
     "retrace_variance_reward",
     "squared_td_error",
+    "tree_backup_lambda_return_estimate",
     "with_policy",
 ]

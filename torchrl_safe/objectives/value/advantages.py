@@ -3,18 +3,29 @@
 from __future__ import annotations
 
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import asdict, dataclass, fields
-from typing import Any
+from dataclasses import dataclass
+from types import SimpleNamespace
+from typing import Any, Literal
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule, dispatch
+from tensordict.nn import (
+    ProbabilisticTensorDictSequential,
+    TensorDictModule,
+    dispatch,
+    skip_existing,
+)
 from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor
-from torchrl.envs.utils import step_mdp
+from torchrl.data import Categorical, OneHot, TensorSpec
 from torchrl.objectives import LossModule
 from torchrl.objectives.utils import register_value_estimator
 from torchrl.objectives.value import ValueEstimatorBase
+from torchrl.objectives.value.advantages import (
+    _self_set_grad_enabled,
+    _self_set_skip_existing,
+    _standardize_by_group,
+)
 
 from torchrl_safe.objectives.value.functional import retrace_lambda_return_estimate
 
@@ -27,21 +38,29 @@ class RetraceEstimator(ValueEstimatorBase):
 
     The target is that of :func:`~torchrl_safe.objectives.value.retrace_lambda_return_estimate`,
     SafeTAC (18), after Munos et al., 2016 (https://arxiv.org/abs/1606.02647). The estimator gathers
-    its arguments from a tensordict of trajectories ``[*B, T]``. An entry that is present is used as
-    it is; one that is missing is computed, always without gradient:
+    its arguments from a tensordict of trajectories ``[*B, T]``:
 
     * reward, ``done`` and ``terminated``: under ``"next"``; ``terminated`` falls back to ``done``;
     * log-density of the stored action under the policy that took it: ``"action_log_prob"``, or
       the actor's own key for it. It cannot be computed;
-    * log-density of the stored action under the current policy: ``"policy_log_prob"``, or from
-      ``actor_network``;
-    * Q(s, a) of the stored action: ``"state_action_value"``, or from ``value_network``;
-    * value of the next state: ``("next", "state_value")``, or ``value_network`` at an action drawn
-      from ``actor_network``.
+    * log-density of the stored action under the current policy: from ``actor_network``, or
+      ``"policy_log_prob"``;
+    * Q(s, a) of the stored action: from ``qvalue_network``, or ``"state_action_value"``;
+    * value of the next state: from ``value_network``, else from ``qvalue_network`` at
+      actions of ``actor_network``, or ``("next", "state_value")``. With an ``action_space`` of
+      discrete actions the expectation over them is exact; otherwise it is a mean over
+      ``num_next_actions`` draws.
+
+    An entry that is present is used where there is no network to compute it, or if
+    ``skip_existing``. What networks compute has no gradient.
 
     A flat batch ``[B * T]`` of slices gives the same targets as ``[B, T]`` if ``done`` marks the
     end of every slice, as :class:`~torchrl.data.SliceSampler` does. Steps must follow each other in
     time: in a batch of unrelated transitions, traces would mix what does not belong together.
+
+    With an entry ``"steps_to_next_obs"`` (n-step transitions) the discount of a step is
+    ``gamma ** steps_to_next_obs``, as in TorchRL's other estimators. The rewards that such a step
+    adds up are not corrected for the change of policy.
 
     **In a loss.** :meth:`for_loss` ties the estimator to the networks of
     :class:`~torchrl.objectives.SACLoss` and its relatives::
@@ -59,15 +78,31 @@ class RetraceEstimator(ValueEstimatorBase):
         gamma (float or Tensor): discount in [0, 1], scalar.
         lmbda (float or Tensor): trace decay in [0, 1], scalar.
         actor_network (ProbabilisticTensorDictSequential, optional): the current policy.
-        value_network (TensorDictModule, optional): the critic Q(s, a).
+        qvalue_network (TensorDictModule, optional): the critic. It writes Q(s, a) under
+            ``"state_action_value"``, or with an ``action_space`` the values of all actions,
+            ``[*B, T, A]``, under ``"action_value"``.
+        value_network (TensorDictModule, optional): writes the value of a state.
+        action_space (str or TensorSpec, optional): ``"one-hot"`` or ``"categorical"``, or a spec of
+            that kind, where ``qvalue_network`` gives the values of all actions.
+        num_next_actions (int): draws in the value of the next state. Defaults to 1.
         average_rewards (bool): standardise rewards over the batch first. Defaults to ``False``.
+        group_key (NestedKey, optional): an integer entry; rewards are standardised within each
+            of its values.
         differentiable (bool): let gradients flow from the outputs of :meth:`forward` to the entries
             read from the tensordict. Defaults to ``False``.
-        skip_existing (bool, optional): ``False`` recomputes Q(s, a) and the current log-density
-            with the networks even if they are present. Defaults to ``None``.
+        vectorized (bool): see the functional. Defaults to ``True``, also when compiling.
+        skip_existing (bool, optional): use entries that are present in place of networks. Defaults
+            to ``None``, that is :func:`tensordict.nn.skip_existing`.
         advantage_key (NestedKey, optional): deprecated, raises; use :meth:`set_keys`.
         value_target_key (NestedKey, optional): deprecated, raises; use :meth:`set_keys`.
         value_key (NestedKey, optional): deprecated, raises; use :meth:`set_keys`.
+        shifted (bool): :meth:`forward` runs the networks once over ``T + shifted_budget`` states,
+            taking the next observation of a step from the step that follows, in place of twice over
+            ``T``. Truncations use up the budget; steps that no longer fit are zero in the outputs
+            and false in ``"shifted_valid"``, see
+            :class:`~torchrl.objectives.value.TDLambdaEstimator`. Not with ``target_params``, nor
+            in a loss. Defaults to ``False``.
+        shifted_budget (int): number of states besides ``T``. Defaults to 1.
         device (torch.device, optional): device of ``gamma`` and ``lmbda``.
         time_dim (int, optional): dimension of time in the tensordict. Defaults to the one named
             ``"time"`` if any, else the last.
@@ -75,14 +110,12 @@ class RetraceEstimator(ValueEstimatorBase):
         value_chunk_size (int, optional): largest number of elements, along ``value_chunk_dim``, of
             one call of the critic.
         num_chunks (int, optional): number of calls of the critic; excludes ``value_chunk_size``.
+        num_chunk (int, optional): alias of ``num_chunks``.
         value_chunk_dim (int): dimension along which calls are split. Defaults to ``0``.
 
-    .. note::
-        There is no ``shifted``: the critic is called at a stored and at a fresh action, so that one
-        pass over a trajectory cannot give both.
-
     Raises:
-        ValueError: if ``gamma`` or ``lmbda`` is not one number in [0, 1], or ``actor_network`` has
+        ValueError: if ``gamma`` or ``lmbda`` is not one number in [0, 1], ``num_next_actions``
+            is not positive, ``action_space`` is of another kind, or ``actor_network`` has
             several log-densities.
 
     Examples:
@@ -112,21 +145,43 @@ class RetraceEstimator(ValueEstimatorBase):
     class _AcceptedKeys(ValueEstimatorBase._AcceptedKeys):
         """Keys of every estimator, and those of actions.
 
+        The base class accepts what is declared here, so that its own keys are repeated.
+
         Attributes:
+            advantage (NestedKey): Target minus Q(s, a). Defaults to ``"advantage"``.
+            value_target (NestedKey): The target. Defaults to ``"value_target"``.
+            value (NestedKey): Value of a state. Defaults to ``"state_value"``.
+            reward (NestedKey): Defaults to ``"reward"``.
+            done (NestedKey): Defaults to ``"done"``.
+            terminated (NestedKey): Defaults to ``"terminated"``.
+            steps_to_next_obs (NestedKey): Defaults to ``"steps_to_next_obs"``.
+            sample_log_prob (NestedKey): Log-density of the stored action under the policy that
+                took it. Defaults to the actor's key, or as in every estimator.
             state_action_value (NestedKey): Q(s, a) of the stored action.
                 Defaults to ``"state_action_value"``.
+            action_value (NestedKey): Values of all discrete actions. Defaults to
+                ``"action_value"``.
             action (NestedKey): The stored action. Defaults to the actor's key, or ``"action"``.
             policy_log_prob (NestedKey): Log-density of the stored action under the current policy.
                 Defaults to ``"policy_log_prob"``.
         """
 
+        advantage: NestedKey = "advantage"
+        value_target: NestedKey = "value_target"
+        value: NestedKey = "state_value"
+        reward: NestedKey = "reward"
+        done: NestedKey = "done"
+        terminated: NestedKey = "terminated"
+        steps_to_next_obs: NestedKey = "steps_to_next_obs"
+        sample_log_prob: NestedKey | None = None
         state_action_value: NestedKey = "state_action_value"
+        action_value: NestedKey = "action_value"
         action: NestedKey = "action"
         policy_log_prob: NestedKey = "policy_log_prob"
 
     default_keys = _AcceptedKeys
-    _tensor_keys: _AcceptedKeys | None
     actor_network: Any
+    qvalue_network: Any
     _loss_module: Any
 
     @classmethod
@@ -135,7 +190,8 @@ class RetraceEstimator(ValueEstimatorBase):
 
         The loss must have an ``actor_network`` and a critic of states and actions, named
         ``qvalue_network`` (:class:`~torchrl.objectives.SACLoss`,
-        :class:`~torchrl.objectives.TD3Loss`) or ``value_network``
+        :class:`~torchrl.objectives.DiscreteSACLoss`, :class:`~torchrl.objectives.TD3Loss`,
+        :class:`~torchrl.objectives.IQLLoss`) or ``value_network``
         (:class:`~torchrl.objectives.DDPGLoss`). A deterministic actor has no density:
         ``"policy_log_prob"`` must then be in the data.
 
@@ -149,38 +205,48 @@ class RetraceEstimator(ValueEstimatorBase):
             RetraceEstimator: the estimator, for ``loss_module.make_value_estimator(...)``.
 
         Raises:
-            ValueError: if the loss has no actor, or no critic of states and actions.
+            ValueError: if the loss has no actor, or no critic of states and actions, or for
+                ``shifted=True``.
         """
-        critic = "qvalue_network" if hasattr(loss_module, "qvalue_network") else "value_network"
+        name = "qvalue_network" if hasattr(loss_module, "qvalue_network") else "value_network"
         keys = loss_module.tensor_keys
+        critic_key = getattr(keys, "state_action_value", getattr(keys, "action_value", None))
         if not (
             hasattr(loss_module, "actor_network")
-            and hasattr(loss_module, critic)
-            and hasattr(keys, "state_action_value")
+            and hasattr(loss_module, name)
+            and critic_key is not None
         ):
             raise ValueError(
                 f"Retrace needs an actor and a critic of states and actions, and "
                 f"{type(loss_module).__name__} lacks one of them."
             )
-        next_value_network = hyperparams.pop("value_network", None)
-        if next_value_network is None:
-            next_value_network = getattr(loss_module, "actor_critic", None)
+        if hyperparams.get("shifted"):
+            raise ValueError("shifted=True: in a loss, the loss computes the next state's value.")
+        value_network = hyperparams.pop("value_network", None)
+        if value_network is None:
+            value_network = getattr(loss_module, "actor_critic", None)
+        if value_network is None and name == "qvalue_network":
+            value_network = getattr(loss_module, "value_network", None)
         hyperparams.setdefault("deactivate_vmap", getattr(loss_module, "deactivate_vmap", False))
+        hyperparams.setdefault("action_space", getattr(loss_module, "action_space", None))
         estimator = cls(
             actor_network=loss_module.actor_network,
-            value_network=getattr(loss_module, critic),
+            qvalue_network=getattr(loss_module, name),
+            value_network=value_network,
             **hyperparams,
         )
         # In __dict__, so that the loss does not become a submodule of its own submodule.
         estimator.__dict__["_loss_module"] = loss_module
-        estimator.__dict__["_next_value_network"] = next_value_network
-        estimator._critic_name = critic
+        estimator._critic_name = name
+        critic_keys = {"state_action_value": critic_key}
+        if estimator.action_space is not None:
+            critic_keys = {"action_value": critic_key}
         estimator.set_keys(
-            value=getattr(keys, "value", keys.state_action_value),
-            state_action_value=keys.state_action_value,
+            value=getattr(keys, "value", critic_key),
             reward=keys.reward,
             done=keys.done,
             terminated=keys.terminated,
+            **critic_keys,
         )
         return estimator
 
@@ -190,22 +256,31 @@ class RetraceEstimator(ValueEstimatorBase):
         gamma: float | Tensor,
         lmbda: float | Tensor,
         actor_network: ProbabilisticTensorDictSequential | None = None,
+        qvalue_network: TensorDictModule | None = None,
         value_network: TensorDictModule | None = None,
+        action_space: Literal["one-hot", "categorical"] | TensorSpec | None = None,
+        num_next_actions: int = 1,
         average_rewards: bool = False,
         differentiable: bool = False,
+        vectorized: bool = True,
         skip_existing: bool | None = None,
         advantage_key: NestedKey | None = None,
         value_target_key: NestedKey | None = None,
         value_key: NestedKey | None = None,
+        shifted: bool = False,
         device: torch.device | None = None,
         time_dim: int | None = None,
         deactivate_vmap: bool = False,
         value_chunk_size: int | None = None,
         num_chunks: int | None = None,
+        num_chunk: int | None = None,
         value_chunk_dim: int = 0,
+        shifted_budget: int = 1,
+        group_key: NestedKey | None = None,
     ) -> None:
         super().__init__(
             value_network=value_network,
+            shifted=shifted,
             differentiable=differentiable,
             skip_existing=skip_existing,
             advantage_key=advantage_key,
@@ -215,7 +290,10 @@ class RetraceEstimator(ValueEstimatorBase):
             deactivate_vmap=deactivate_vmap,
             value_chunk_size=value_chunk_size,
             num_chunks=num_chunks,
+            num_chunk=num_chunk,
             value_chunk_dim=value_chunk_dim,
+            shifted_budget=shifted_budget,
+            group_key=group_key,
         )
         for name, value in (("gamma", gamma), ("lmbda", lmbda)):
             buffer = torch.as_tensor(value, device=self._device)
@@ -223,11 +301,16 @@ class RetraceEstimator(ValueEstimatorBase):
                 raise ValueError(f"{name} must be one number in [0, 1], got {value}.")
             # Settings, not state: a checkpoint of the loss holds neither.
             self.register_buffer(name, buffer.reshape(()), persistent=False)
+        if num_next_actions < 1:
+            raise ValueError(f"num_next_actions must be at least 1, got {num_next_actions}.")
+        self.num_next_actions = num_next_actions
+        self.action_space = _discrete(action_space)
         self.average_rewards = average_rewards
+        self.vectorized = vectorized
         self.time_dim = time_dim
         self.__dict__["actor_network"] = actor_network
+        self.__dict__["qvalue_network"] = qvalue_network
         self.__dict__["_loss_module"] = None
-        self.__dict__["_next_value_network"] = None
         self._critic_name: str | None = None
         keys: dict[str, NestedKey] = {}
         if actor_network is not None and hasattr(actor_network, "get_dist"):
@@ -240,32 +323,6 @@ class RetraceEstimator(ValueEstimatorBase):
             keys["sample_log_prob"] = actor_network.log_prob_keys[0]
         self.set_keys(**keys)
 
-    def set_keys(self, **kwargs: NestedKey) -> None:
-        """Set tensordict key names.
-
-        Keyword Args:
-            **kwargs: a key for each name, among those of every estimator (``advantage``,
-                ``value_target``, ``value``, ``reward``, ``done``, ``terminated``,
-                ``sample_log_prob``) and ``state_action_value``, ``action``, ``policy_log_prob``.
-
-        Raises:
-            KeyError: for a name that is not one of these.
-            ValueError: for a key that is neither a string nor a tuple of strings.
-        """
-        # The base class wants the critic to write `value`; a critic of actions writes another key.
-        accepted = {field.name for field in fields(self._AcceptedKeys)}
-        for name, key in kwargs.items():
-            if name not in accepted:
-                raise KeyError(
-                    f"{name} is not an accepted tensordict key for {type(self).__name__}; "
-                    f"choose from {sorted(accepted)}."
-                )
-            if not isinstance(key, (str, tuple)):
-                raise ValueError(f"The key of {name} must be a string or a tuple, got {key!r}.")
-        keys = {name: unravel_key(key) for name, key in kwargs.items()}
-        current = self.default_keys() if self._tensor_keys is None else self._tensor_keys
-        self._tensor_keys = self._AcceptedKeys(**{**asdict(current), **keys})
-
     @property
     def in_keys(self) -> list[NestedKey]:
         """Keys that :meth:`forward` reads, as far as networks do not compute them."""
@@ -274,10 +331,12 @@ class RetraceEstimator(ValueEstimatorBase):
         if self.actor_network is not None:
             actor_keys = [*self.actor_network.in_keys, keys.action]
         critic_keys, next_keys = [keys.state_action_value], [keys.value]
+        if self.qvalue_network is not None:
+            critic_keys = self.qvalue_network.in_keys
         if self.value_network is not None:
-            critic_keys = self.value_network.in_keys
-            if self.actor_network is not None:
-                next_keys = [*self.actor_network.in_keys, *self.value_network.in_keys]
+            next_keys = self.value_network.in_keys
+        elif self.qvalue_network is not None and self.actor_network is not None:
+            next_keys = [*self.actor_network.in_keys, *self.qvalue_network.in_keys]
         next_keys = [keys.reward, keys.done, keys.terminated, *next_keys]
         in_keys = [
             *actor_keys,
@@ -285,8 +344,12 @@ class RetraceEstimator(ValueEstimatorBase):
             keys.sample_log_prob,
             *(unravel_key(("next", key)) for key in next_keys if key != keys.action),
         ]
+        if self.group_key is not None:
+            in_keys.append(self.group_key)
         return list(dict.fromkeys(in_keys))
 
+    @_self_set_skip_existing
+    @_self_set_grad_enabled
     @dispatch
     def forward(
         self,
@@ -302,11 +365,12 @@ class RetraceEstimator(ValueEstimatorBase):
             tensordict (TensorDictBase): trajectories ``[*B, T]``, see the class for its entries.
 
         Keyword Args:
-            params (TensorDictBase, optional): parameters of ``value_network`` for the action value
+            params (TensorDictBase, optional): parameters of ``qvalue_network`` for the action value
                 that the advantage is relative to. With one batch dimension they are an ensemble,
                 of which the minimum is taken.
-            target_params (TensorDictBase, optional): parameters of ``value_network`` in the target.
-                Defaults to ``params``.
+            target_params (TensorDictBase, optional): parameters in the target: of
+                ``value_network`` if there is one, else of ``qvalue_network``, where they default
+                to ``params``.
             time_dim (int, optional): overrides the constructor's.
 
         Returns:
@@ -316,67 +380,92 @@ class RetraceEstimator(ValueEstimatorBase):
         Raises:
             KeyError: if an input is missing that no network computes.
             RuntimeError: if the tensordict has no batch dimension.
-            ValueError: if shapes disagree.
+            ValueError: if shapes disagree, or for ``target_params`` when ``shifted``.
         """
         if not tensordict.batch_dims:
             raise RuntimeError(
                 "Retrace needs trajectories, and the tensordict has no dimension of time: "
                 f"batch_size={tuple(tensordict.batch_size)}."
             )
-        with nullcontext() if self.differentiable else torch.no_grad():
+        time_dim = self._get_time_dim(time_dim, tensordict)
+        data, valid = tensordict, None
+        if self.shifted:
+            if target_params is not None:
+                raise ValueError("shifted=True has one set of parameters; leave out target_params.")
+            value, next_value, log_pi, valid = self._shifted_values(tensordict, params, time_dim)
+            target_value = value
+            data = self._prepare_shifted_tensordict(tensordict, valid, time_dim)
+        else:
+            log_pi = self._policy_log_prob(tensordict)
             value = self._action_value(tensordict, params)
-            target_value = None
-            if target_params is None and self._loss_module is None:
-                target_params, target_value = params, value
-            target = self.value_estimate(
-                tensordict, target_params, action_value=target_value, time_dim=time_dim
-            )
-            advantage = target - value
-        tensordict.set(self.tensor_keys.advantage, advantage)
+            critic_params = self._critic_params(target_params)
+            if critic_params is None and self._loss_module is None:
+                critic_params = params
+            target_value = value
+            if critic_params is not params:
+                target_value = self._action_value(tensordict, critic_params)
+            next_value = self._next_state_value(tensordict, target_params, critic_params)
+        target = self._target(data, log_pi, target_value, next_value, time_dim)
+        tensordict.set(self.tensor_keys.advantage, target - value)
         tensordict.set(self.tensor_keys.value_target, target)
+        self._mask_shifted_output(tensordict, valid)
         return tensordict
 
+    @_self_set_skip_existing
     def value_estimate(
         self,
         tensordict: TensorDictBase,
         target_params: TensorDictBase | None = None,
         next_value: Tensor | None = None,
         time_dim: int | None = None,
-        *,
-        action_value: Tensor | None = None,
+        **kwargs: Any,
     ) -> Tensor:
         """Return the target; the tensordict is left as it is.
 
         Args:
             tensordict (TensorDictBase): trajectories ``[*B, T]``, see the class for its entries.
-            target_params (TensorDictBase, optional): parameters of ``value_network``; with one
-                batch dimension they are an ensemble, of which the minimum is taken. When tied to a
-                loss, parameters of what computes the value of the next state.
+            target_params (TensorDictBase, optional): parameters of ``value_network`` if there is
+                one, else of ``qvalue_network``; with one batch dimension these are an ensemble, of
+                which the minimum is taken.
             next_value (Tensor, optional): value of the next state, in the shape of the reward.
             time_dim (int, optional): overrides the constructor's.
-            action_value (Tensor, optional): Q(s, a), in the shape of the reward.
+            **kwargs: unused, as in TorchRL's other estimators.
 
         Returns:
             Tensor: the target, in the shape of the reward.
 
         Raises:
             KeyError: if an input is missing that no network computes.
-            ValueError: if shapes disagree, or rewards were summed over several steps.
+            ValueError: if shapes disagree.
         """
-        keys = self.tensor_keys
-        if tensordict.get(keys.steps_to_next_obs, None) is not None:
-            raise ValueError(
-                f"Retrace corrects single steps, and the entry {keys.steps_to_next_obs!r} marks "
-                "multi-step rewards; leave out the MultiStep transform."
-            )
-        reward = _get(tensordict, ("next", keys.reward), "the reward")
-        if self.average_rewards:
-            reward = (reward - reward.mean()) / reward.std().clamp_min(1e-4)
-        if action_value is None:
-            critic_params = target_params if self._loss_module is None else None
-            action_value = self._action_value(tensordict, critic_params)
+        critic_params = self._critic_params(target_params)
+        log_pi = self._policy_log_prob(tensordict)
+        action_value = self._action_value(tensordict, critic_params)
         if next_value is None:
-            next_value = self._next_state_value(tensordict, target_params)
+            next_value = self._next_state_value(tensordict, target_params, critic_params)
+        time_dim = self._get_time_dim(time_dim, tensordict)
+        return self._target(tensordict, log_pi, action_value, next_value, time_dim)
+
+    def _target(
+        self,
+        tensordict: TensorDictBase,
+        log_pi: Tensor,
+        action_value: Tensor,
+        next_value: Tensor,
+        time_dim: int,
+    ) -> Tensor:
+        keys = self.tensor_keys
+        reward = _get(tensordict, ("next", keys.reward), "the reward")
+        gamma = self.gamma
+        steps = tensordict.get(keys.steps_to_next_obs, None)
+        if steps is not None:
+            gamma = gamma ** steps.view_as(reward)
+        if self.average_rewards:
+            groups = self._group_ids(tensordict)
+            if groups is None:
+                reward = (reward - reward.mean()) / reward.std().clamp_min(1e-4)
+            else:
+                reward = _standardize_by_group(reward, groups)
         log_mu = _get(
             tensordict,
             keys.sample_log_prob,
@@ -384,88 +473,161 @@ class RetraceEstimator(ValueEstimatorBase):
             "built with return_log_prob=True)",
         )
         return retrace_lambda_return_estimate(
-            self.gamma,
+            gamma,
             self.lmbda,
-            _with_feature(self._policy_log_prob(tensordict), tensordict),
+            log_pi,
             _with_feature(log_mu, tensordict),
             action_value,
             next_value,
             reward,
             _get(tensordict, ("next", keys.done), "the end of trajectories"),
             tensordict.get(unravel_key(("next", keys.terminated)), None),
-            time_dim=self._get_time_dim(time_dim, tensordict),
+            vectorized=self.vectorized,
+            time_dim=time_dim,
         )
 
-    def _reads(self, tensordict: TensorDictBase, key: NestedKey, network: Any) -> Tensor | None:
-        """The entry, unless a network is to recompute it."""
-        if self.skip_existing is False and network is not None:
-            return None
-        return tensordict.get(key, None)
-
     def _policy_log_prob(self, tensordict: TensorDictBase) -> Tensor:
-        keys, actor = self.tensor_keys, self.actor_network
-        log_prob = self._reads(tensordict, keys.policy_log_prob, actor)
-        if log_prob is not None:
-            return log_prob
-        if not hasattr(actor, "get_dist"):
+        key, actor = self.tensor_keys.policy_log_prob, self.actor_network
+        has_density = hasattr(actor, "get_dist")
+        if skip_existing() or not has_density:
+            log_prob = tensordict.get(key, None)
+            if log_prob is not None:
+                return _with_feature(log_prob, tensordict)
+        if not has_density:
             raise KeyError(
-                f"{keys.policy_log_prob!r}, the log-density of the stored action under the current "
-                "policy, is not in the tensordict, and there is no actor_network with a "
-                f"distribution to compute it, got {type(actor).__name__}. In a loss, build the "
-                "estimator with RetraceEstimator.for_loss(loss, ...)."
+                f"{key!r}, the log-density of the stored action under the current policy, is not "
+                "in the tensordict, and there is no actor_network with a distribution to compute "
+                f"it, got {type(actor).__name__}. In a loss, build the estimator with "
+                "RetraceEstimator.for_loss(loss, ...)."
             )
-        action = _get(tensordict, keys.action, "the stored action")
-        with torch.no_grad(), self._actor_params():
-            return actor.get_dist(_select(tensordict, actor, "actor_network")).log_prob(action)
+        action = _get(tensordict, self.tensor_keys.action, "the stored action")
+        with torch.no_grad():
+            return _with_feature(self._policy(tensordict).log_prob(action), tensordict)
+
+    def _policy(self, tensordict: TensorDictBase) -> Any:
+        """The current policy's distribution."""
+        actor, loss = self.actor_network, self._loss_module
+        with _parameters(None if loss is None else loss.actor_network_params, actor):
+            return actor.get_dist(_select(tensordict, actor, "actor_network"))
+
+    def _critic_params(self, target_params: TensorDictBase | None) -> TensorDictBase | None:
+        """What of ``target_params`` is the critic's."""
+        tied = self._loss_module is not None
+        return None if tied or self.value_network is not None else target_params
 
     def _action_value(self, tensordict: TensorDictBase, params: TensorDictBase | None) -> Tensor:
-        keys, critic = self.tensor_keys, self.value_network
-        if params is None:
-            value = self._reads(tensordict, keys.state_action_value, critic)
+        keys = self.tensor_keys
+        if skip_existing() or self.qvalue_network is None:
+            value = tensordict.get(keys.state_action_value, None)
             if value is not None:
                 return value
-        if critic is None:
+        if self.qvalue_network is None:
             raise KeyError(
                 f"{keys.state_action_value!r}, the value of the stored action, is not in the "
-                "tensordict, and there is no value_network to compute it. In a loss, build the "
+                "tensordict, and there is no qvalue_network to compute it. In a loss, build the "
                 "estimator with RetraceEstimator.for_loss(loss, ...)."
             )
-        return self._call_critic(tensordict, params)
+        return self._of_stored_action(self._call_critic(tensordict, params), tensordict)
+
+    def _of_stored_action(self, value: Tensor, tensordict: TensorDictBase) -> Tensor:
+        """Q(s, a) from the values of all actions, where these are discrete."""
+        if self.action_space is None:
+            return value
+        action = _get(tensordict, self.tensor_keys.action, "the stored action")
+        if self.action_space == "one_hot":
+            return (value * action).sum(-1, keepdim=True)
+        return value.gather(-1, _with_feature(action, tensordict))
 
     def _next_state_value(
-        self, tensordict: TensorDictBase, target_params: TensorDictBase | None
+        self,
+        tensordict: TensorDictBase,
+        target_params: TensorDictBase | None,
+        critic_params: TensorDictBase | None,
     ) -> Tensor:
-        keys, actor = self.tensor_keys, self.actor_network
-        value = tensordict.get(unravel_key(("next", keys.value)), None)
-        if value is not None:
-            return value
-        if self._next_value_network is not None and target_params is not None:
-            network = self._next_value_network
-            with torch.no_grad(), target_params.to_module(network, preserve_module_state=False):
-                return network(step_mdp(tensordict, keep_other=False)).get(keys.value)
-        if self._loss_module is not None or actor is None or self.value_network is None:
+        key = unravel_key(("next", self.tensor_keys.value))
+        tied = self._loss_module is not None
+        sampled = self.actor_network is not None and self.qvalue_network is not None
+        computes = self.value_network is not None or (sampled and not tied)
+        # A loss that computes the value itself writes it, and passes no parameters.
+        if skip_existing() or not computes or (tied and target_params is None):
+            value = tensordict.get(key, None)
+            if value is not None:
+                return value
+        if not computes or (tied and target_params is None):
             raise KeyError(
-                f"{unravel_key(('next', keys.value))!r}, the value of the next state, is not in "
-                "the tensordict. Write it, pass next_value, or build the estimator with "
-                "actor_network and value_network; one tied to a loss expects it from the loss."
+                f"{key!r}, the value of the next state, is not in the tensordict. Write it, pass "
+                "next_value, or build the estimator with value_network, or with actor_network and "
+                "qvalue_network; one tied to a loss expects it from the loss."
             )
-        next_tensordict = tensordict.get("next").copy()
         with torch.no_grad():
-            dist = actor.get_dist(_select(next_tensordict, actor, "actor_network"))
-            next_tensordict.set(keys.action, dist.sample())
-            return self._call_critic(next_tensordict, target_params)
+            if self.value_network is not None:
+                return self._next_value(tensordict, target_params, kwargs={})
+            next_tensordict = tensordict.get("next")
+            return self._expected_value(
+                self._policy(next_tensordict), next_tensordict, critic_params
+            )
+
+    def _expected_value(
+        self, dist: Any, tensordict: TensorDictBase, params: TensorDictBase | None
+    ) -> Tensor:
+        """Value of a state under its policy, from the critic."""
+        if self.action_space is not None:
+            return (dist.probs * self._call_critic(tensordict, params)).sum(-1, keepdim=True)
+        tensordict = tensordict.copy()
+        values = [
+            self._call_critic(tensordict.set(self.tensor_keys.action, dist.sample()), params)
+            for _ in range(self.num_next_actions)
+        ]
+        return torch.stack(values).mean(0)
+
+    def _shifted_values(
+        self, tensordict: TensorDictBase, params: TensorDictBase | None, time_dim: int
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Q(s, a), V(s'), log pi(a | s) and the mask of the steps that fit."""
+        actor, critic, action_key = self.actor_network, self.qvalue_network, self.tensor_keys.action
+        if actor is None or critic is None or self.value_network is not None:
+            raise ValueError(
+                "shifted=True needs actor_network and qvalue_network, and no value_network."
+            )
+
+        def call(states: TensorDictBase) -> Tensor:
+            with torch.no_grad():
+                dist = self._policy(states)
+                log_pi = _with_feature(dist.log_prob(states.get(action_key)), states)
+                value = self._call_critic(states, params)
+                if self.action_space is None:
+                    state_value = self._expected_value(dist, states, params)
+                else:
+                    state_value = (dist.probs * value).sum(-1, keepdim=True)
+                return torch.cat([self._of_stored_action(value, states), state_value, log_pi], -1)
+
+        network = SimpleNamespace(in_keys=list({*actor.in_keys, *critic.in_keys, action_key}))
+        values, next_values, valid = self._call_value_net_shifted(
+            tensordict,
+            params=None,
+            next_params=None,
+            value_key=self.tensor_keys.value,
+            ndim=time_dim + 1,
+            value_net=network,
+            _call_value_net=call,
+        )
+        features = values.shape[-1] // 2
+        value, _, log_pi = values.split([features, features, 1], -1)
+        return value, next_values[..., features:-1], log_pi, valid
 
     def _call_critic(self, tensordict: TensorDictBase, params: TensorDictBase | None) -> Tensor:
-        critic, key = self.value_network, self.tensor_keys.state_action_value
-        tensordict = _select(tensordict, critic, "value_network")
-        if params is None and self._loss_module is not None:
-            params = getattr(self._loss_module, f"target_{self._critic_name}_params")
+        critic, loss = self.qvalue_network, self._loss_module
+        keys = self.tensor_keys
+        key = keys.state_action_value if self.action_space is None else keys.action_value
+        tensordict = _select(tensordict, critic, "qvalue_network")
+        if params is None and loss is not None:
+            params = getattr(loss, f"target_{self._critic_name}_params")
 
         def call(params: TensorDictBase | None) -> Tensor:
             with _parameters(params, critic):
                 chunks = self._split_value_net_input(tensordict)
                 values = [
-                    _get(critic(chunk.copy()), key, "an output of value_network")
+                    _get(critic(chunk.copy()), key, "an output of qvalue_network")
                     for chunk in chunks
                 ]
             return torch.cat(values, self._resolve_value_chunk_dim(tensordict.ndim))
@@ -479,9 +641,19 @@ class RetraceEstimator(ValueEstimatorBase):
                 values = torch.vmap(call, randomness=self.vmap_randomness)(params)
             return values.amin(0)
 
-    def _actor_params(self) -> AbstractContextManager:
-        params = None if self._loss_module is None else self._loss_module.actor_network_params
-        return _parameters(params, self.actor_network)
+
+def _discrete(action_space: str | TensorSpec | None) -> str | None:
+    if isinstance(action_space, OneHot):
+        return "one_hot"
+    if isinstance(action_space, Categorical):
+        return "categorical"
+    name = action_space.replace("-", "_") if isinstance(action_space, str) else action_space
+    if name not in (None, "one_hot", "categorical"):
+        raise ValueError(
+            "action_space must be 'one-hot', 'categorical' or a spec of that kind, got "
+            f"{action_space}."
+        )
+    return name
 
 
 def _parameters(params: TensorDictBase | None, module: TensorDictModule) -> AbstractContextManager:
@@ -503,5 +675,5 @@ def _select(tensordict: TensorDictBase, module: TensorDictModule, name: str) -> 
     return tensordict.select(*module.in_keys)
 
 
-def _with_feature(log_prob: Tensor, tensordict: TensorDictBase) -> Tensor:
-    return log_prob.unsqueeze(-1) if log_prob.shape == tensordict.batch_size else log_prob
+def _with_feature(tensor: Tensor, tensordict: TensorDictBase) -> Tensor:
+    return tensor.unsqueeze(-1) if tensor.shape == tensordict.batch_size else tensor

@@ -8,7 +8,7 @@ import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torch import nn
-from torchrl.data import Bounded
+from torchrl.data import Bounded, Composite, MultiStep
 from torchrl.modules import MLP, NormalParamExtractor, ProbabilisticActor, TanhNormal, ValueOperator
 from torchrl.objectives import SACLoss, SoftUpdate, ValueEstimators
 
@@ -247,6 +247,139 @@ class TestLossModule:
         prediction = loss._vmap_qnetworkN0(data, loss.qvalue_network_params)["other_value"]
         expected = prediction.square().sum(0).mean()
         torch.testing.assert_close(loss.qvalue_v2_loss(data)[0], expected)
+
+    def test_nested_keys(self, blocks):
+        """The losses of nested entries are those of the same entries at the top."""
+        data, nested = make_data(), TensorDict(batch_size=[8])
+        for key in ("observation", "action"):
+            nested["agent", key] = data[key]
+        nested["next", "agent", "observation"] = data["next", "observation"]
+        flags = data["next"].select("reward", "done", "terminated")
+        nested["next", "signals"] = flags.rename_key_("done", "end").rename_key_(
+            "terminated", "stop"
+        )
+        actor, qvalue = blocks
+        spec = Composite(agent=Composite(action=Bounded(-1, 1, (ACT,), dtype=torch.float64)))
+        actor = ProbabilisticActor(
+            TensorDictModule(
+                actor.module[0].module,
+                in_keys=[("agent", "observation")],
+                out_keys=["loc", "scale"],
+            ),
+            in_keys=["loc", "scale"],
+            out_keys=[("agent", "action")],
+            spec=spec,
+            distribution_class=TanhNormal,
+        )
+        qvalue = ValueOperator(
+            qvalue.module,
+            in_keys=[("agent", "observation"), ("agent", "action")],
+            out_keys=[("agent", "q")],
+        )
+        losses = []
+        for networks, inputs in ((blocks, data), ((actor, qvalue), nested)):
+            torch.manual_seed(1)
+            loss = TsallisLoss(*networks, delay_qvalue=False, target_entropy=-1.0)
+            if inputs is nested:
+                loss.set_keys(
+                    action=("agent", "action"),
+                    state_action_value=("agent", "q"),
+                    reward=("signals", "reward"),
+                    done=("signals", "end"),
+                    terminated=("signals", "stop"),
+                    priority=("agent", "priority"),
+                )
+            torch.manual_seed(2)
+            losses.append(loss(inputs))
+        assert nested["agent", "priority"].shape == (8,)
+        for key in losses[0].keys():
+            torch.testing.assert_close(losses[1][key], losses[0][key])
+
+    def test_dispatch(self, blocks):
+        loss = TsallisLoss(*blocks, delay_qvalue=False)
+        data = make_data()
+        torch.manual_seed(2)
+        expected = loss(data)
+        torch.manual_seed(2)
+        outputs = loss(
+            observation=data["observation"],
+            action=data["action"],
+            **{f"next_{key}": value for key, value in data["next"].items()},
+        )
+        for key, value in zip(loss.out_keys, outputs, strict=True):
+            torch.testing.assert_close(value, expected[key])
+
+    @pytest.mark.parametrize("separate_losses", [False, True])
+    def test_separate_losses(self, blocks, separate_losses):
+        """With separate losses the Q-value loss does not move what the critic shares."""
+        trunk = nn.Linear(OBS, OBS, dtype=torch.float64)
+        heads = (MLP(OBS, 2 * ACT, num_cells=[]).double(), MLP(OBS + ACT, 1, num_cells=[]).double())
+        actor = ProbabilisticActor(
+            TensorDictModule(
+                nn.Sequential(trunk, heads[0], NormalParamExtractor()),
+                in_keys=["observation"],
+                out_keys=["loc", "scale"],
+            ),
+            in_keys=["loc", "scale"],
+            spec=Bounded(-1, 1, (ACT,), dtype=torch.float64),
+            distribution_class=TanhNormal,
+        )
+
+        class Critic(nn.Module):
+            def __init__(self):
+                super().__init__()
+                self.trunk, self.head = trunk, heads[1]
+
+            def forward(self, observation, action):
+                return self.head(torch.cat([self.trunk(observation), action], -1))
+
+        qvalue = ValueOperator(Critic(), in_keys=["observation", "action"])
+        loss = TsallisLoss(
+            actor,
+            qvalue,
+            num_qvalue_nets=1,
+            delay_qvalue=False,
+            separate_losses=separate_losses,
+        )
+        loss(make_data())["loss_qvalue"].backward()
+        params = loss.qvalue_network_params["module"]
+        assert params["head", "0", "weight"].grad.any()
+        # An ensemble has a copy of the trunk of its own; with separate losses it borrows the
+        # actor's, which its loss does not move.
+        shared = params["trunk", "weight"]
+        assert (shared.grad is None) is separate_losses
+        assert torch.equal(shared[0], trunk.weight) is separate_losses
+        assert trunk.weight.grad is None
+
+    def test_multi_step_batch(self, blocks):
+        """The target of 3-step transitions: three rewards, then the value of the third state."""
+        loss = TsallisLoss(*blocks, alpha_init=0.3, fixed_alpha=True, delay_qvalue=False)
+        loss.make_value_estimator(ValueEstimators.TD0, gamma=0.9)
+        data = make_data((2, 6))
+        data["next", "done"][:] = data["next", "terminated"][:] = False
+        data["collector", "mask"] = torch.ones(2, 6, dtype=torch.bool)
+        batch = MultiStep(gamma=0.9, n_steps=3)(data.clone())
+        torch.manual_seed(5)
+        target = loss.compute_target(batch)[:, 0]
+        one_step = data.clone()
+        one_step["next", "observation"] = batch["next", "observation"]
+        one_step["next", "reward"] = torch.zeros_like(one_step["next", "reward"])
+        torch.manual_seed(5)
+        bootstrap = loss.compute_target(one_step)[:, 0] / 0.9
+        rewards = data["next", "reward"]
+        expected = sum(0.9**k * rewards[:, k] for k in range(3)) + 0.9**3 * bootstrap
+        torch.testing.assert_close(target, expected)
+
+    def test_reset_parameters_recursive(self, blocks):
+        loss = TsallisLoss(*blocks)
+        before = {name: p.clone() for name, p in loss.named_parameters()}
+        loss.reset_parameters_recursive()
+        after = dict(loss.named_parameters())
+        assert after.keys() == before.keys()
+        for name, parameter in after.items():
+            assert isinstance(parameter, nn.Parameter)
+            if name.endswith("weight"):
+                assert not torch.equal(parameter, before[name])
 
     def test_state_dict(self, blocks):
         loss = TsallisLoss(*blocks)

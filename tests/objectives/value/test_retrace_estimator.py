@@ -35,6 +35,7 @@ from torchrl.objectives.value import TD0Estimator, TDLambdaEstimator
 
 from torchrl_safe.objectives.value import RetraceEstimator, retrace_lambda_return_estimate
 
+RETRACE = "retrace"
 GAMMA, LMBDA = 0.99, 0.9
 OBS, ACT = 3, 2
 
@@ -966,7 +967,7 @@ def test_loss_forwards_its_keys() -> None:
 
 def test_registry() -> None:
     class RetraceSAC(SACLoss):
-        SUPPORTED_VALUE_ESTIMATORS = (*SACLoss.SUPPORTED_VALUE_ESTIMATORS, "retrace")
+        SUPPORTED_VALUE_ESTIMATORS = (*SACLoss.SUPPORTED_VALUE_ESTIMATORS, RETRACE)
 
     loss = RetraceSAC(make_actor(), make_critic())
     loss.set_keys(reward="cost")

@@ -5,7 +5,7 @@ from __future__ import annotations
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from types import SimpleNamespace
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import torch
 from tensordict import TensorDictBase
@@ -18,7 +18,6 @@ from tensordict.nn import (
 from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor
 from torchrl.data import Categorical, OneHot, TensorSpec
-from torchrl.objectives import LossModule
 from torchrl.objectives.utils import register_value_estimator
 from torchrl.objectives.value import ValueEstimatorBase
 from torchrl.objectives.value.advantages import (
@@ -28,6 +27,9 @@ from torchrl.objectives.value.advantages import (
 )
 
 from torchrl_safe.objectives.value.functional import retrace_lambda_return_estimate
+
+if TYPE_CHECKING:
+    from torchrl.objectives import LossModule
 
 __all__ = ["RetraceEstimator"]
 

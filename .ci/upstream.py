@@ -1,0 +1,153 @@
+"""Apply the contribution of docs/upstream.md to a source tree of TorchRL.
+
+python .ci/upstream.py PATH/TO/rl
+
+Moves the functionals and the estimator behind the code that is there, with their exports, enum
+member, docs entry, tests and benchmark. Upstream text that is not found as expected stops it before
+anything is written.
+"""
+
+from __future__ import annotations
+
+import ast
+import re
+import sys
+from pathlib import Path
+
+HERE = Path(__file__).parents[1]
+ESTIMATES = [
+    "retrace_lambda_return_estimate",
+    "importance_sampling_lambda_return_estimate",
+    "tree_backup_lambda_return_estimate",
+    "q_lambda_return_estimate",
+]
+SAFETAC_ONLY = {"retrace_variance_reward", "squared_td_error", "_one_step_cost"}
+FUTURE = "from __future__ import annotations\n"
+
+
+def definitions(path: str, without: set[str] = frozenset()) -> str:
+    """Functions and classes of a file of ours, in order."""
+    text = (HERE / path).read_text()
+    lines = text.splitlines()
+    parts = []
+    for node in ast.parse(text).body:
+        if isinstance(node, (ast.FunctionDef, ast.ClassDef)) and node.name not in without:
+            first = min([node.lineno, *(line.lineno for line in node.decorator_list)])
+            parts.append("\n".join(lines[first - 1 : node.end_lineno]))
+    return "\n\n\n" + "\n\n\n".join(parts) + "\n"
+
+
+def insert(text: str, before: str, addition: str) -> str:
+    """Put text before the first line that starts with something, indentation aside."""
+    match = re.search(rf"^[ \t]*{re.escape(before)}", text, re.MULTILINE)
+    if match is None:
+        raise SystemExit(f"expected a line that starts with {before!r}; upstream has changed")
+    return text[: match.start()] + addition + text[match.start() :]
+
+
+def upstream(text: str) -> str:
+    """Text of ours under upstream's names."""
+    text = re.sub(
+        r"torchrl_safe\.objectives\.value\.(\w+_estimate)",
+        r"torchrl.objectives.value.functional.\1",
+        text,
+    )
+    text = text.replace("torchrl_safe.", "torchrl.")
+    text = text.replace(
+        'register_value_estimator("retrace",',
+        "register_value_estimator(\n    ValueEstimators.Retrace,",
+    )
+    return text.replace('RETRACE = "retrace"', "RETRACE = ValueEstimators.Retrace")
+
+
+def main(root: Path) -> None:
+    """Read everything, then write everything."""
+    value = root / "torchrl/objectives/value"
+    files = {}
+
+    text = (value / "functional.py").read_text()
+    text = insert(
+        text, '"vtrace_advantage_estimate"', "".join(f'    "{name}",\n' for name in ESTIMATES)
+    )
+    text = insert(text, "import math", "from collections.abc import Sequence\n")
+    text = insert(text, "import torch", "").replace(
+        "import torch\n", "import torch\nfrom torch import Tensor\n", 1
+    )
+    files[value / "functional.py"] = text + definitions(
+        "torchrl_safe/objectives/value/functional.py", SAFETAC_ONLY
+    )
+
+    text = (value / "advantages.py").read_text()
+    text = insert(
+        text,
+        "import torch",
+        "from types import SimpleNamespace\nfrom typing import Any, Literal, TYPE_CHECKING\n\n",
+    )
+    text = text.replace(
+        "from contextlib import nullcontext",
+        "from contextlib import AbstractContextManager, nullcontext",
+    )
+    text = insert(
+        text,
+        "ProbabilisticTensorDictModule,",
+        "    ProbabilisticTensorDictSequential,\n    skip_existing,\n",
+    )
+    text = insert(
+        text,
+        "from torchrl.envs.utils import",
+        "from torchrl.data.tensor_specs import Categorical, OneHot, TensorSpec\n",
+    )
+    text = insert(text, "td0_return_estimate,", "    retrace_lambda_return_estimate,\n")
+    text = insert(
+        text,
+        "def _standardize_by_group(",
+        "if TYPE_CHECKING:\n    from torchrl.objectives.common import LossModule\n\n\n",
+    )
+    files[value / "advantages.py"] = text + upstream(
+        definitions("torchrl_safe/objectives/value/advantages.py")
+    )
+
+    text = (value / "__init__.py").read_text()
+    text = insert(text, "TD0Estimate,", "    RetraceEstimator,\n")
+    files[value / "__init__.py"] = insert(text, '"TD0Estimate",', '    "RetraceEstimator",\n')
+
+    utils = root / "torchrl/objectives/utils.py"
+    text = insert(utils.read_text(), 'VTrace = "', '    Retrace = "Retrace(lambda)"\n')
+    files[utils] = insert(
+        text,
+        "ValueEstimators.VTrace: {",
+        '    ValueEstimators.Retrace: {"gamma": 0.99, "lmbda": 0.97},\n',
+    )
+
+    docs = root / "docs/source/reference/objectives_common.rst"
+    files[docs] = insert(docs.read_text(), "MultiAgentGAE", "    RetraceEstimator\n")
+
+    licence = (value / "__init__.py").read_text().split("\n\n")[0] + "\n"
+    tests = HERE / "tests/objectives/value"
+    for name in ("functional", "estimator"):
+        text = upstream((tests / f"test_retrace_{name}.py").read_text())
+        if name == "functional":
+            text = text.replace(
+                "from torchrl.objectives.value import (",
+                "from torchrl.objectives.value.functional import (",
+            )
+        else:
+            text = text.replace(
+                "from torchrl.objectives.value import RetraceEstimator, "
+                "retrace_lambda_return_estimate",
+                "from torchrl.objectives.utils import ValueEstimators\n"
+                "from torchrl.objectives.value import RetraceEstimator\n"
+                "from torchrl.objectives.value.functional import retrace_lambda_return_estimate",
+            )
+        files[root / f"test/objectives/test_retrace_{name}.py"] = licence + text
+    text = upstream((HERE / "benchmarks/bench_retrace.py").read_text())
+    text = text.replace("def bench_", "def test_")
+    files[root / "benchmarks/test_retrace_benchmark.py"] = licence + text
+
+    for path, text in files.items():
+        path.write_text(text)
+        sys.stdout.write(f"{path.relative_to(root)}\n")
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]))

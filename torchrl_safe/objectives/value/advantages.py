@@ -45,15 +45,16 @@ class RetraceEstimator(ValueEstimatorBase):
     * reward, ``done`` and ``terminated``: under ``"next"``; ``terminated`` falls back to ``done``;
     * log-density of the stored action under the policy that took it: ``"action_log_prob"``, or
       the actor's own key for it. It cannot be computed;
-    * log-density of the stored action under the current policy: from ``actor_network``, or
-      ``"policy_log_prob"``;
+    * log-density of the stored action under the current policy: ``"policy_log_prob"``, or from
+      ``actor_network``. Nothing but a caller writes that entry, so that it is used if present
+      unless ``skip_existing=False``;
     * Q(s, a) of the stored action: from ``qvalue_network``, or ``"state_action_value"``;
     * value of the next state: from ``value_network``, else from ``qvalue_network`` at
       actions of ``actor_network``, or ``("next", "state_value")``. With an ``action_space`` of
       discrete actions the expectation over them is exact; otherwise it is a mean over
       ``num_next_actions`` draws.
 
-    An entry that is present is used where there is no network to compute it, or if
+    Values that are present are used where there is no network to compute them, or if
     ``skip_existing``. What networks compute has no gradient.
 
     A flat batch ``[B * T]`` of slices gives the same targets as ``[B, T]`` if ``done`` marks the
@@ -491,7 +492,7 @@ class RetraceEstimator(ValueEstimatorBase):
     def _policy_log_prob(self, tensordict: TensorDictBase) -> Tensor:
         key, actor = self.tensor_keys.policy_log_prob, self.actor_network
         has_density = hasattr(actor, "get_dist")
-        if skip_existing() or not has_density:
+        if self.skip_existing is not False or not has_density:
             log_prob = tensordict.get(key, None)
             if log_prob is not None:
                 return _with_feature(log_prob, tensordict)

@@ -222,7 +222,7 @@ def test_goal_reward_against_a_loop():
     rng = np.random.default_rng(0)
     before, after = rng.uniform(0, 1, (2, 500))
     after[0] = 0.3
-    reward, reached = tasks.goal_reward(GoalTask(), before, after)
+    reward, reached = tasks.goal_reward(before, after, 0.3)
     for i in range(500):
         bonus = 1.0 if after[i] <= 0.3 else 0.0
         assert reward[i] == pytest.approx(before[i] - after[i] + bonus, abs=1e-15)

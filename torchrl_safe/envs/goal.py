@@ -14,6 +14,7 @@ from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
 
 from torchrl_safe.envs._core import Frame, make_core
+from torchrl_safe.envs.randomization import Randomization
 from torchrl_safe.envs.tasks import GoalTask, Task
 
 
@@ -52,6 +53,8 @@ class SafeGoalEnv(EnvBase):
             steps into its episode, so that truncations, and with them new layouts, are spread over
             time. Default: ``False``.
         task (Task, optional): the task with its options. Default: the robot's.
+        randomization (Randomization, optional): ranges that each robot's mass, friction, actuators
+            and sensors are drawn from at every reset. Default: all are as their model.
         device (torch.device, optional): device of the tensors; the simulation runs on the CPU.
 
     Raises:
@@ -75,6 +78,7 @@ class SafeGoalEnv(EnvBase):
         episode_length: int = 1000,
         stagger: bool = False,
         task: Task | None = None,
+        randomization: Randomization | None = None,
         device: torch.device | str | None = None,
     ) -> None:
         core = make_core(
@@ -85,6 +89,7 @@ class SafeGoalEnv(EnvBase):
             seed=seed,
             episode_length=episode_length,
             stagger=stagger,
+            randomization=randomization,
         )
         super().__init__(device=device, batch_size=torch.Size([num_envs]))
         self._core = core

@@ -165,7 +165,8 @@ _JACKAL = Robot(
     keepout=0.4,
     action_dim=2,
     proprioception_scale=(0.5, 0.5),
-    place=partial(_place_free, height=0.0, joints=(0.0, 0.0)),
+    # At rest the tyres sink into the floor by so much.
+    place=partial(_place_free, height=-0.00042, joints=(0.0, 0.0)),
     control=_control_wheels,
     sense=_sense_wheels,
     task="navigation",

@@ -59,8 +59,8 @@ class NavigationTask:
         ValueError: if an option is out of range.
 
     Examples:
-        >>> NavigationTask(num_boxes=4).max_cost
-        100.0
+        >>> NavigationTask(num_boxes=4).num_boxes
+        4
     """
 
     num_boxes: int = 8

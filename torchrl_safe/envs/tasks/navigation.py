@@ -293,50 +293,49 @@ def ray_distances(task: NavigationTask, position: Array, heading: Array, boxes: 
     Returns:
         array: [N, R], metres.
     """
-    rays = _lidar(task).rays
-    num_envs, num_rays = len(position), len(rays)
+    rays, half = _lidar(task).rays, task.box_half_size
+    num_rays = len(rays)
     cos, sin = heading[:, :1], heading[:, 1:]
-    # 1 / x, for x of either sign and zero.
     per_x = 1.0 / _not_zero(cos * rays[:, 0] - sin * rays[:, 1])
     per_y = 1.0 / _not_zero(sin * rays[:, 0] + cos * rays[:, 1])
-    to_wall = [
-        task.wall_distance * np.abs(inverse) - position[:, [axis]] * inverse
-        for axis, inverse in enumerate((per_x, per_y))
-    ]
-    out = np.minimum(np.minimum(*to_wall), task.lidar_range)
+    out = np.minimum(
+        task.wall_distance * np.abs(per_x) - position[:, :1] * per_x,
+        task.wall_distance * np.abs(per_y) - position[:, 1:] * per_y,
+    )
+    out = np.minimum(out, task.lidar_range)
     out[np.abs(position).max(-1) > task.wall_distance] = task.lidar_range
 
-    # A box meets few rays: only those within the angle of the disc around it are looked at.
+    # A box meets few rays, those within the angle of the disc around it: no others are looked at.
+    radius = np.sqrt(2.0) * half
     offset = boxes - position[:, None]
-    distance = length(offset)
-    radius = np.sqrt(2.0) * task.box_half_size
-    spread = np.arcsin(radius / np.maximum(distance, radius))
-    spread[distance <= radius] = np.pi
-    bearing = np.arctan2(offset[..., 1], offset[..., 0]) - np.arctan2(sin, cos) - _FIRST_RAY
-    bearing %= 2.0 * np.pi
-    # What begins before the first ray may also end behind the last one, a turn further.
-    pair = np.tile(np.arange(num_envs * boxes.shape[1]), 2)
-    bearing = np.concatenate((bearing, bearing - 2.0 * np.pi), None)
-    spread = np.tile(spread.ravel(), 2)
-    per_ray = (num_rays - 1) / (-2.0 * _FIRST_RAY)
-    first = np.maximum(np.ceil((bearing - spread) * per_ray), 0.0).astype(np.intp)
-    last = np.minimum(np.floor((bearing + spread) * per_ray), num_rays - 1.0).astype(np.intp)
-    count = np.maximum(last - first + 1, 0)
-    count[np.tile((distance > task.lidar_range + radius).ravel(), 2)] = 0
-    end = count.cumsum()
+    row, column = np.nonzero((offset * offset).sum(-1) < (task.lidar_range + radius) ** 2)
+    x, y = offset[row, column].T
+    distance = np.hypot(x, y)
+    spread = np.where(distance > radius, np.arcsin(radius / np.maximum(distance, radius)), np.pi)
+    first_ray = np.arctan2(heading[:, 1], heading[:, 0]) + _FIRST_RAY
+    bearing = (np.arctan2(y, x) - first_ray[row]) % (2.0 * np.pi)
+    # What ends a turn after the first ray or later meets rays from the first one on, too.
+    again = np.flatnonzero(bearing + spread >= 2.0 * np.pi)
+    pair = np.concatenate((np.arange(len(row)), again))
+    bearing = np.concatenate((bearing, bearing[again] - 2.0 * np.pi))
+    spread = spread[pair]
+    per_angle = (num_rays - 1) / (-2.0 * _FIRST_RAY)
+    first = np.ceil((bearing - spread) * per_angle).clip(0.0).astype(np.intp)
+    last = np.floor((bearing + spread) * per_angle).clip(None, num_rays - 1.0).astype(np.intp)
+    count = (last - first + 1).clip(0)
+    start = row[pair] * num_rays + first - count.cumsum() + count
+    index = np.repeat(start, count)
+    index += np.arange(len(index))
     pair = np.repeat(pair, count)
-    ray = np.arange(len(pair)) + np.repeat(first - end + count, count)
-    index = (pair // boxes.shape[1]) * num_rays + ray
 
-    # Slabs: a ray is within a box where it is within its two strips, across and along.
+    # Slabs: a ray is in a box where it is within both of its strips.
     per_x, per_y = per_x.ravel()[index], per_y.ravel()[index]
-    x, y = offset.reshape(-1, 2)[pair].T
-    x, y = x * per_x, y * per_y
-    half_x, half_y = task.box_half_size * np.abs(per_x), task.box_half_size * np.abs(per_y)
-    enter = np.maximum(x - half_x, y - half_y)
-    leave = np.minimum(x + half_x, y + half_y)
-    enter = np.where((enter <= leave) & (leave >= 0.0), np.maximum(enter, 0.0), np.inf)
-    np.minimum.at(out.reshape(-1), index, enter)
+    centre_x, centre_y = x[pair] * per_x, y[pair] * per_y
+    half_x, half_y = half * np.abs(per_x), half * np.abs(per_y)
+    enter = np.maximum(centre_x - half_x, centre_y - half_y)
+    leave = np.minimum(centre_x + half_x, centre_y + half_y)
+    hit = np.flatnonzero((enter <= leave) & (leave >= 0.0))
+    np.minimum.at(out.reshape(-1), index[hit], enter[hit].clip(0.0))
     return out
 
 

@@ -299,6 +299,36 @@ class TestRobot:
             following = step(env, (-1.0, 1.0))
         assert following["observation"][0, 4].item() * 0.5 == pytest.approx(1.0, abs=0.1)
 
+    def test_four_skidding_wheels_would_not_do(self):
+        """Why the Jackal stands on two: four driven wheels answer a yaw rate by a quarter of it."""
+        spec = mujoco.MjSpec.from_file(str(JACKAL.asset_path))
+        for caster in ("front", "rear"):
+            spec.delete(spec.geom(caster))
+        robot = spec.body("robot")
+        for side, y in (("left", 0.188), ("right", -0.188)):
+            spec.body(side).pos[0] = 0.131
+            rear = robot.add_body(name=f"rear_{side}", pos=(-0.131, y, 0.098))
+            rear.mass, rear.inertia, rear.explicitinertial = (
+                0.954,
+                (0.00242, 0.00458, 0.00242),
+                True,
+            )
+            rear.add_joint(name=f"rear_{side}", axis=(0, 1, 0))
+            rear.add_geom(size=(0.098, 0, 0), contype=1, friction=(1, 0.005, 0.0001))
+            servo = spec.add_actuator(name=f"rear_{side}", target=f"rear_{side}")
+            servo.trntype = mujoco.mjtTrn.mjTRN_JOINT
+            servo.set_to_velocity(kv=2.0)
+        model = spec.compile()
+        model.opt.timestep = JACKAL.timestep
+        data = mujoco.MjData(model)
+        rates = []
+        for _ in range(60):
+            wheels = JACKAL.control(np.array([(-1.0, 1.0)]), data.qpos[None], data.qvel[None])[0]
+            data.ctrl[:] = np.tile(wheels, 2)
+            mujoco.mj_step(model, data, JACKAL.substeps)
+            rates.append(data.qvel[5])
+        assert np.mean(rates[20:]) < 0.5
+
     def test_never_goes_backwards(self):
         env = make(8, task=NavigationTask(num_boxes=0))
         env.reset()

@@ -241,6 +241,12 @@ def test_hazard_cost_against_a_loop():
     assert 0 < violation.sum() < len(position)
 
 
+def test_binary_cost():
+    cost, violation = tasks.hazard_cost(GoalTask(binary_cost=True), np.array([[0.1], [0.2], [0.3]]))
+    assert cost.tolist() == [1.0, 1.0, 0.0]
+    assert violation.tolist() == [True, True, False]
+
+
 def test_hazard_cost_at_the_rim_far_away_and_without_hazards():
     cost, violation = tasks.hazard_cost(GoalTask(), np.array([[0.2], [1e6]]))
     assert cost.tolist() == [0.5, 0.0]

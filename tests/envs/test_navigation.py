@@ -462,6 +462,23 @@ class TestEnv:
         assert any(violations)
         assert not violations[0]
 
+    def test_a_diverging_robot_is_truncated_and_counted(self, tmp_path, monkeypatch):
+        monkeypatch.chdir(tmp_path)  # MuJoCo logs its warning there
+        env = make(3)
+        env.reset()
+        step(env, AHEAD)
+        layout, state = env.layout(1), env.state_dict()
+        state["physics"][1, 1 + 9 :][:3] = 1e12  # time, positions, then velocities
+        env.load_state_dict(state)
+        following = step(env, AHEAD)
+        assert env.instabilities == 1
+        assert following["truncated"].flatten().tolist() == [False, True, False]
+        assert not following["terminated"].any()
+        assert following["reward"][1] == 0.0
+        assert all((env.layout(1)[name] == value).all() for name, value in layout.items())
+        for leaf in ("observation", "reward", "cost"):
+            assert following[leaf].isfinite().all()
+
     def test_threads(self):
         controls = torch.rand(40, 5, 2, generator=torch.Generator().manual_seed(0)) * 2 - 1
         rollouts = []

@@ -392,7 +392,7 @@ class TestBadInput:
     @pytest.mark.parametrize(
         ("options", "match"),
         [
-            ({"robot": "snake"}, "robot must be one of 'point'"),
+            ({"robot": "snake"}, "robot must be one of .*'point'"),
             ({"num_envs": 0}, "num_envs must be an integer >= 1, got 0"),
             ({"num_threads": -1}, "num_threads must be an integer >= 1, got -1"),
             ({"episode_length": 2.5}, "episode_length must be an integer >= 1, got 2.5"),

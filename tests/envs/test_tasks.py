@@ -222,7 +222,7 @@ def test_goal_reward_against_a_loop():
     rng = np.random.default_rng(0)
     before, after = rng.uniform(0, 1, (2, 500))
     after[0] = 0.3
-    reward, reached = tasks.goal_reward(GoalTask(), before, after)
+    reward, reached = tasks.goal_reward(before, after, 0.3)
     for i in range(500):
         bonus = 1.0 if after[i] <= 0.3 else 0.0
         assert reward[i] == pytest.approx(before[i] - after[i] + bonus, abs=1e-15)
@@ -239,6 +239,12 @@ def test_hazard_cost_against_a_loop():
         assert cost[i] == pytest.approx(1 / (1 + math.exp(-10 * (0.2 - nearest))), rel=1e-12)
         assert violation[i] == (nearest <= 0.2)
     assert 0 < violation.sum() < len(position)
+
+
+def test_binary_cost():
+    cost, violation = tasks.hazard_cost(GoalTask(binary_cost=True), np.array([[0.1], [0.2], [0.3]]))
+    assert cost.tolist() == [1.0, 1.0, 0.0]
+    assert violation.tolist() == [True, True, False]
 
 
 def test_hazard_cost_at_the_rim_far_away_and_without_hazards():
@@ -306,5 +312,5 @@ def test_task_rejects(options, error, match):
 
 def test_unknown_robot_names_the_known_ones():
     assert isinstance(get_robot("point"), Robot)
-    with pytest.raises(ValueError, match=r"one of 'point'.* got 'snake'"):
+    with pytest.raises(ValueError, match=r"one of .*'point'.* got 'snake'"):
         get_robot("snake")

@@ -45,6 +45,8 @@ class ScriptedEnv(EnvBase):
             goal_met=flag(),
             shape=self.batch_size,
         )
+        if "violations" in tables:
+            self.observation_spec["violations"] = Unbounded(shape, dtype=torch.int64)
         self.action_spec = Bounded(-1, 1, shape=shape)
         self.full_reward_spec = Composite(
             reward=Unbounded(shape), cost=Unbounded(shape), shape=self.batch_size
@@ -57,7 +59,8 @@ class ScriptedEnv(EnvBase):
 
     def _observation(self) -> dict[str, torch.Tensor]:
         no = torch.zeros(*self.batch_size, 1, dtype=torch.bool)
-        return {
+        counts = {"violations": no.long()} if "violations" in self.tables else {}
+        return counts | {
             "observation": self.time[..., None].float(),
             "violation": no,
             "goal_met": no.clone(),
@@ -166,6 +169,35 @@ def test_evaluate_against_brute_force(num_steps):
         assert set(episodes.keys()) == set(expected)
         for name, value in expected.items():
             assert episodes[name][n].item() == pytest.approx(value, rel=1e-6, abs=1e-6), (name, n)
+
+
+def test_a_step_can_count_for_many_violations():
+    """Environment 0 collides at its third step of ten, environment 1 is near at two of ten."""
+    script = tables(10, batch=(2,))
+    script["violations"] = torch.zeros(10, 2, dtype=torch.int64)
+    script["violations"][2, 0] = 8
+    script["terminated"][2, 0] = True
+    script["violations"][3:5, 1] = 1
+    script["violation"] = torch.ones(10, 2, dtype=torch.bool)  # the counts are read instead
+    env = ScriptedEnv(**script)
+    check_env_specs(env)
+    episodes = evaluate(env, constant_policy(0.0), num_steps=10, exploration_type=DETERMINISTIC)
+    assert episodes["violations"].tolist() == [8, 2]
+    assert episodes["length"].tolist() == [3, 10]
+    # Both episodes are ten steps long, had one not ended.
+    assert episodes["cv_rate"].tolist() == pytest.approx([0.8, 0.2])
+    for n, steps in ((0, 3), (1, 10)):
+        cost, reward = (script[name][:steps, n].sum().item() for name in ("cost", "reward"))
+        assert episodes["cost_rate"][n].item() == pytest.approx(cost / 10, rel=1e-6)
+        assert episodes["score"][n].item() == pytest.approx(reward / (9, 3)[n], rel=1e-6)
+
+    batch = TensorDict({"next": {k: v[:3, 0, None] for k, v in script.items()}}, [3])
+    assert count_violations(batch) == 8
+    metrics = batch_metrics(batch)
+    assert metrics["train/cv_rate"] == pytest.approx(0.8)
+    assert metrics["train/cost_rate"] == pytest.approx(script["cost"][:3, 0].sum().item() / 10)
+    reward = script["reward"][:3, 0].sum().item()
+    assert metrics["train/reward_per_1000"] == pytest.approx(100 * reward)
 
 
 def test_evaluate_stops_when_all_are_done():

@@ -1,7 +1,18 @@
-"""Environments with a cost: the batched goal environment, its robots and its task."""
+"""Environments with a cost: the batched environment, its robots and their tasks."""
 
 from torchrl_safe.envs.goal import SafeGoalEnv
+from torchrl_safe.envs.randomization import JACKAL_REAL, JACKAL_TRAINING, Randomization
 from torchrl_safe.envs.robots import ROBOTS, Robot, get_robot
-from torchrl_safe.envs.tasks import GoalTask
+from torchrl_safe.envs.tasks import GoalTask, NavigationTask
 
-__all__ = ["ROBOTS", "GoalTask", "Robot", "SafeGoalEnv", "get_robot"]
+__all__ = [
+    "JACKAL_REAL",
+    "JACKAL_TRAINING",
+    "ROBOTS",
+    "GoalTask",
+    "NavigationTask",
+    "Randomization",
+    "Robot",
+    "SafeGoalEnv",
+    "get_robot",
+]

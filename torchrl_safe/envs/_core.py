@@ -15,6 +15,12 @@ from mujoco.batch import Batch, SimulationError
 from numpy.typing import NDArray
 
 from torchrl_safe.envs._random import RandomStreams
+from torchrl_safe.envs.randomization import (
+    Randomization,
+    Variation,
+    add_noise,
+    drop_readings,
+)
 from torchrl_safe.envs.robots import Array, Motion, Robot, get_robot
 from torchrl_safe.envs.tasks import TASKS, Objects, Task
 
@@ -38,18 +44,32 @@ class RobotBatch:
         robot (Robot): the robot.
         num_envs (int): how many, N.
         num_threads (int): threads that step them, this one included.
+        max_delay (int, optional): most environment steps a command can be late by. ``None`` for
+            robots that are all as their model, which is cheaper.
 
     Attributes:
         motion (Motion): where the robots are and what they sense. Its acceleration is that of the
             last physics step: MuJoCo's derived fields lag behind the state by one.
+        variation (Variation or None): how the robots differ from their model.
+        commands (array or None): [N, max_delay + 1, nu], the last ones, newest first.
     """
 
-    def __init__(self, robot: Robot, num_envs: int, num_threads: int) -> None:
+    def __init__(
+        self, robot: Robot, num_envs: int, num_threads: int, max_delay: int | None = None
+    ) -> None:
         self.robot = robot
         self.num_envs = num_envs
         self.num_threads = num_threads
         plane = np.zeros((num_envs, 2))
         self.motion = Motion(plane, plane, np.zeros((num_envs, len(robot.proprioception_scale))))
+        self.variation: Variation | None = None
+        self.commands: Array | None = None
+        self._model = mujoco.MjModel.from_xml_path(str(robot.asset_path))
+        self._model.opt.timestep = robot.timestep
+        if max_delay is not None:
+            one, zero = np.ones(num_envs), np.zeros(num_envs)
+            self.variation = Variation(one, one, one, zero, zero, zero)
+            self.commands = np.zeros((num_envs, max_delay + 1, self._model.nu))
         self._batch: Batch | None = None
         self._saved: Array | None = None
 
@@ -57,26 +77,41 @@ class RobotBatch:
     def batch(self) -> Batch:
         """The thread pool."""
         if self._batch is None:
-            model = mujoco.MjModel.from_xml_path(str(self.robot.asset_path))
-            model.opt.timestep = self.robot.timestep
-            self._batch = batch = Batch(model, self.num_envs, self.num_threads)
+            self._batch = batch = Batch(self._model, self.num_envs, self.num_threads)
             self._initial = batch.state[0].copy()
             self._qpos, self._qvel = batch.bind("qpos"), batch.bind("qvel")
             self._ctrl, self._qacc = batch.bind("ctrl"), batch.bind("qacc")
+            if self.variation is not None:
+                self.vary(np.arange(self.num_envs), self.variation)
             if self._saved is not None:
                 batch.state[:] = self._saved
                 self._saved = None
         return self._batch
 
     def __getstate__(self) -> dict[str, Any]:
-        kept = ("robot", "num_envs", "num_threads", "motion")
+        bound = ("_initial", "_qpos", "_qvel", "_ctrl", "_qacc")
+        kept = {name: value for name, value in self.__dict__.items() if name not in bound}
         saved = self._saved if self._batch is None else self._batch.state.copy()
-        return {name: getattr(self, name) for name in kept} | {"_batch": None, "_saved": saved}
+        return kept | {"_batch": None, "_saved": saved}
 
     @property
     def state(self) -> Array:
         """The live state, [N, S]: writing it is setting the simulations."""
         return self.batch.state
+
+    def vary(self, rows: Rows, variation: Variation) -> None:
+        """Makes the robots ``rows`` differ from their model, without compiling another one."""
+        assert self.variation is not None
+        batch, model = self.batch, self._model
+        pairs = zip(self.variation, variation, strict=True)
+        self.variation = Variation(*(_with_rows(old, rows, new) for old, new in pairs))
+        mass, friction, gain, *_ = (factor[:, None] for factor in variation)
+        batch.expand("body_mass")[rows] = model.body_mass * mass
+        batch.expand("body_inertia")[rows] = model.body_inertia * mass[..., None]
+        batch.expand("dof_damping")[rows] = model.dof_damping * friction
+        batch.expand("geom_friction")[rows] = model.geom_friction * friction[..., None]
+        batch.expand("actuator_gainprm")[rows] = model.actuator_gainprm * gain[..., None]
+        batch.set_const(rows)
 
     def place(self, rows: Rows, position: Array, yaw: Array) -> None:
         """Puts the robots ``rows`` at rest at position [n, 2] and yaw [n]."""
@@ -84,6 +119,8 @@ class RobotBatch:
         batch.state[rows] = self._initial
         self._qpos[rows] = self.robot.place(position, yaw)
         batch.forward(rows)
+        if self.commands is not None:
+            self.commands = _with_rows(self.commands, rows, np.zeros(1))
         sensed = self.robot.sense(self._qpos[rows], self._qvel[rows], self._qacc[rows])
         pairs = zip(self.motion, sensed, strict=True)
         self.motion = Motion(*(_with_rows(old, rows, new) for old, new in pairs))
@@ -96,7 +133,7 @@ class RobotBatch:
         """
         batch = self.batch
         before = batch.state.copy()
-        self._ctrl[:] = self.robot.control(action, self._qpos, self._qvel)
+        self._ctrl[:] = self._late(self.robot.control(action, self._qpos, self._qvel))
         try:
             batch.step(nstep=self.robot.substeps)
             failed = np.zeros(self.num_envs, bool)
@@ -111,6 +148,14 @@ class RobotBatch:
             sensed = Motion(*(_with_rows(new, failed, old[failed]) for new, old in pairs))
         self.motion = sensed
         return failed
+
+    def _late(self, command: Array) -> Array:
+        """The command [N, nu] that arrives when this one is sent."""
+        if self.variation is None or self.commands is None:
+            return command
+        self.commands = np.concatenate((command[:, None], self.commands[:, :-1]), 1)
+        delay = self.variation.actuator_delay.astype(np.intp)
+        return self.commands[np.arange(self.num_envs), delay]
 
 
 class Frame(NamedTuple):
@@ -146,6 +191,7 @@ class Core:
         seed: int | None,
         episode_length: int,
         stagger: bool,
+        randomization: Randomization | None,
     ) -> None:
         for name, value in (
             ("num_envs", num_envs),
@@ -164,7 +210,9 @@ class Core:
         self.instabilities = 0
         self.action_dim = robot.action_dim
         self.observation_size = task.observation_size(robot)
-        self._robots = RobotBatch(robot, num_envs, num_threads)
+        self.randomization = randomization
+        max_delay = None if randomization is None else randomization.actuator_delay[1]
+        self._robots = RobotBatch(robot, num_envs, num_threads, max_delay)
         self._started = False
         self._objects: Objects = {
             name: np.zeros((num_envs, *value.shape[1:])) for name, value in objects.items()
@@ -196,6 +244,8 @@ class Core:
         if not rows.size:
             return self._frame
         position, yaw, objects = self.task.sample(self.robot, self._streams, rows)
+        if self.randomization is not None:
+            self._robots.vary(rows, self.randomization.sample(self._streams, rows))
         self._robots.place(rows, position, yaw)
         self._objects = {
             name: _with_rows(old, rows, objects[name]) for name, old in self._objects.items()
@@ -207,7 +257,7 @@ class Core:
         sensed = self.task.sense(self.robot, motion, objects)
         no = np.zeros(len(rows), bool)
         fresh = Frame(
-            self.task.observe(self.robot, motion, objects, sensed.scan),
+            self._observe(rows, motion, objects, sensed.scan),
             reward=np.zeros(len(rows)),
             cost=sensed.cost,
             violation=sensed.violation,
@@ -254,7 +304,7 @@ class Core:
         outcome = self.task.advance(robot, motion, self._objects, sensed, remaining, self._streams)
         self._objects = outcome.objects
         self._frame = Frame(
-            self.task.observe(robot, motion, self._objects, sensed.scan),
+            self._observe(np.arange(self.num_envs), motion, self._objects, sensed.scan),
             outcome.reward,
             outcome.cost,
             outcome.violations > 0,
@@ -264,6 +314,17 @@ class Core:
             truncated=(remaining == 0) | failed,
         )
         return self._frame
+
+    def _observe(
+        self, rows: Rows, motion: Motion, objects: Objects, scan: Array
+    ) -> NDArray[np.float32]:
+        """What the robots ``rows`` show, through their sensors."""
+        variation = self._robots.variation
+        if variation is None:
+            return self.task.observe(self.robot, motion, objects, scan)
+        scan = drop_readings(scan, variation.lidar_dropout[rows], self._streams, rows)
+        observation = self.task.observe(self.robot, motion, objects, scan)
+        return add_noise(observation, variation.sensor_noise[rows], self._streams, rows)
 
     def layout(self, index: int) -> dict[str, Array]:
         """Copies of robot [2], heading [2] and the task's objects of one environment, metres."""
@@ -294,6 +355,10 @@ class Core:
             "started": np.array(self._started),
             "instabilities": np.array(self.instabilities),
         }
+        variation, commands = self._robots.variation, self._robots.commands
+        if variation is not None and commands is not None:
+            state["commands"] = commands
+            state |= {f"variation_{name}": value for name, value in variation._asdict().items()}
         frame = {f"frame_{name}": value for name, value in self._frame._asdict().items()}
         return {name: np.array(value) for name, value in (state | frame).items()}
 
@@ -317,6 +382,10 @@ class Core:
                     f"got {new.dtype} of shape {new.shape}."
                 )
         copy = {name: np.array(value) for name, value in snapshot.items()}
+        if self._robots.variation is not None:
+            variation = Variation(*(copy[f"variation_{name}"] for name in Variation._fields))
+            self._robots.vary(np.arange(self.num_envs), variation)
+            self._robots.commands = copy["commands"]
         self._robots.state[:] = copy["physics"]
         self._robots.motion = Motion(*(copy[name] for name in Motion._fields))
         self._objects = {name: copy[name] for name in self._objects}
@@ -336,6 +405,7 @@ def make_core(
     seed: int | None,
     episode_length: int,
     stagger: bool = False,
+    randomization: Randomization | None = None,
 ) -> Core:
     """N environments of one robot and one task: what every face of ours wraps.
 
@@ -348,6 +418,7 @@ def make_core(
         episode_length (int): steps after which an episode is truncated.
         stagger (bool): whether a reset of all environments starts them at different phases of an
             episode.
+        randomization (Randomization, optional): how the robots differ from their model.
 
     Raises:
         ValueError: if the robot is unknown, an option is out of range or the objects do not fit.
@@ -362,6 +433,7 @@ def make_core(
         seed=seed,
         episode_length=episode_length,
         stagger=stagger,
+        randomization=randomization,
     )
 
 

@@ -14,16 +14,19 @@ from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
 
 from torchrl_safe.envs._core import Frame, make_core
+from torchrl_safe.envs.randomization import Randomization
+from torchrl_safe.envs.robots import Robot
 from torchrl_safe.envs.tasks import GoalTask, Task
 
 
 class SafeGoalEnv(EnvBase):
     """Robots driving to goals among hazards, N at a time in one process.
 
-    Reward and cost are those of equation (19) of SafeTAC: progress towards the goal plus one for
-    reaching it, and ``sigmoid(10 (0.2 - distance to the nearest hazard))``, both after the step.
-    Episodes end by truncation only; a reached goal moves within the step. Physics run in float64,
-    tensors are float32.
+    Reward and cost are those of SafeTAC. In the goal task, equation (19): progress towards the goal
+    plus one for reaching it, and ``sigmoid(10 (0.2 - distance to the nearest hazard))``, both after
+    the step; episodes end by truncation only. In the navigation task, Jackal's, boxes and walls are
+    seen by a lidar and cost by it, and a contact terminates. A reached goal moves within the step.
+    Physics run in float64, tensors are float32.
 
     Entries under ``"next"`` after a step, N being ``num_envs``:
 
@@ -31,7 +34,8 @@ class SafeGoalEnv(EnvBase):
       goal distance, acceleration (2), velocity (2), yaw rate, lidar; fixed scaling;
     * ``reward`` and ``cost``, [N, 1];
     * ``violation``, [N, 1] bool, inside a hazard; ``violations``, [N, 1] int64, how many violating
-      steps this one counts for, here 0 or 1; ``goal_met``, [N, 1] bool, goal reached in this step;
+      steps this one counts for: a contact stands for the rest of its episode; ``goal_met``, [N, 1]
+      bool, goal reached in this step;
     * ``done``, ``terminated``, ``truncated``, [N, 1] bool.
 
     Each environment draws from its own random stream, so its layouts depend on the seed and its
@@ -39,7 +43,8 @@ class SafeGoalEnv(EnvBase):
     its last observation and is truncated; ``env.instabilities`` counts such steps.
 
     Args:
-        robot (str): name of the robot, see ``torchrl_safe.envs.ROBOTS``. Default: ``"point"``.
+        robot (str or Robot): the robot, or its name in ``torchrl_safe.envs.ROBOTS``. Default:
+            ``"point"``.
 
     Keyword Args:
         num_envs (int): environments in the batch, N. Default: 64.
@@ -52,6 +57,8 @@ class SafeGoalEnv(EnvBase):
             steps into its episode, so that truncations, and with them new layouts, are spread over
             time. Default: ``False``.
         task (Task, optional): the task with its options. Default: the robot's.
+        randomization (Randomization, optional): ranges that each robot's mass, friction, actuators
+            and sensors are drawn from at every reset. Default: all are as their model.
         device (torch.device, optional): device of the tensors; the simulation runs on the CPU.
 
     Raises:
@@ -67,7 +74,7 @@ class SafeGoalEnv(EnvBase):
 
     def __init__(
         self,
-        robot: str = "point",
+        robot: str | Robot = "point",
         *,
         num_envs: int = 64,
         num_threads: int = 2,
@@ -75,6 +82,7 @@ class SafeGoalEnv(EnvBase):
         episode_length: int = 1000,
         stagger: bool = False,
         task: Task | None = None,
+        randomization: Randomization | None = None,
         device: torch.device | str | None = None,
     ) -> None:
         core = make_core(
@@ -85,6 +93,7 @@ class SafeGoalEnv(EnvBase):
             seed=seed,
             episode_length=episode_length,
             stagger=stagger,
+            randomization=randomization,
         )
         super().__init__(device=device, batch_size=torch.Size([num_envs]))
         self._core = core

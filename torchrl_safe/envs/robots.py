@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -13,6 +14,8 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 _ASSETS = Path(__file__).parent / "assets"
+
+_JACKAL_WHEEL_RADIUS, _JACKAL_TRACK = 0.098, 0.376
 
 
 class Motion(NamedTuple):
@@ -46,6 +49,8 @@ class Robot:
         control (callable): ``(action [N, A], qpos [N, nq], qvel [N, nv]) -> ctrl [N, nu]``.
         sense (callable): ``(qpos [N, nq], qvel [N, nv], qacc [N, nv]) -> Motion``.
         task (str): the name of the task it does by default.
+        footprint (tuple of float, optional): half the length and half the width in metres of the
+            rectangle around the robot that must not touch anything, for tasks with obstacles.
 
     Examples:
         >>> get_robot("point").substeps
@@ -63,6 +68,7 @@ class Robot:
     control: Callable[[Array, Array, Array], Array]
     sense: Callable[[Array, Array, Array], Motion]
     task: str = "goal"
+    footprint: tuple[float, float] | None = None
 
     @property
     def asset_path(self) -> Path:
@@ -97,8 +103,24 @@ def _place_planar(position: Array, yaw: Array) -> Array:
     return np.column_stack((position, yaw))
 
 
+def _place_free(position: Array, yaw: Array, height: float, joints: tuple[float, ...]) -> Array:
+    """A free base, level at a height, and the joints behind it."""
+    qpos = np.zeros((len(position), 7 + len(joints)))
+    qpos[:, :2] = position
+    qpos[:, 2] = height
+    qpos[:, 3], qpos[:, 6] = np.cos(yaw / 2.0), np.sin(yaw / 2.0)
+    qpos[:, 7:] = joints
+    return qpos
+
+
 def _control_directly(action: Array, qpos: Array, qvel: Array) -> Array:
     return action
+
+
+def _control_wheels(action: Array, qpos: Array, qvel: Array) -> Array:
+    """Wheel speeds (left, right), rad/s, for a velocity in [0, 1] m/s and a yaw rate in rad/s."""
+    velocity, turn = (action[:, 0] + 1.0) / 2.0, action[:, 1] * (_JACKAL_TRACK / 2.0)
+    return np.stack((velocity - turn, velocity + turn), 1) / _JACKAL_WHEEL_RADIUS
 
 
 def _sense_planar(qpos: Array, qvel: Array, qacc: Array) -> Motion:
@@ -111,6 +133,15 @@ def _sense_planar(qpos: Array, qvel: Array, qacc: Array) -> Motion:
     proprioception[:, 2:4] = to_robot_frame(qvel[:, :2], heading)
     proprioception[:, 4] = qvel[:, 2]
     return Motion(qpos[:, :2].copy(), heading, proprioception)
+
+
+def _sense_wheels(qpos: Array, qvel: Array, qacc: Array) -> Motion:
+    """Forward velocity and yaw rate of a level free base on wheels."""
+    w, x, y, z = qpos[:, 3:7].T
+    ahead = np.stack((1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y + w * z)), 1)
+    heading = ahead / np.hypot(ahead[:, 0], ahead[:, 1])[:, None]
+    forward = (heading * qvel[:, :2]).sum(1)
+    return Motion(qpos[:, :2].copy(), heading, np.stack((forward, qvel[:, 5]), 1))
 
 
 _POINT = Robot(
@@ -126,7 +157,24 @@ _POINT = Robot(
     sense=_sense_planar,
 )
 
-ROBOTS: dict[str, Robot] = {robot.name: robot for robot in (_POINT,)}
+_JACKAL = Robot(
+    name="jackal",
+    asset="jackal.xml",
+    timestep=0.002,
+    substeps=16,
+    keepout=0.4,
+    action_dim=2,
+    proprioception_scale=(0.5, 0.5),
+    # At rest the tyres sink into the floor by so much.
+    place=partial(_place_free, height=-0.00042, joints=(0.0, 0.0)),
+    control=_control_wheels,
+    sense=_sense_wheels,
+    task="navigation",
+    # The wheels reach further than the chassis, in both directions.
+    footprint=(0.229, 0.208),
+)
+
+ROBOTS: dict[str, Robot] = {robot.name: robot for robot in (_POINT, _JACKAL)}
 
 
 def get_robot(name: str) -> Robot:

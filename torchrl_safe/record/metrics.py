@@ -4,6 +4,11 @@ Every definition lives here once, as a pure function or a sum over an episode, a
 "SafeTAC: Safe Tsallis Actor-Critic Reinforcement Learning for Safer Exploration" (section V), which
 takes it from "TRC: Trust Region Conditional Value at Risk" (Kim and Oh, RA-L 2022): the score of an
 episode is ``R / (1 + CV)``, where CV counts its violating steps.
+
+An environment says whether a step violates in ``("next", "violation")``, or for how many violating
+steps it counts in ``("next", "violations")``, which is read where there is one: a collision that
+ends an episode counts for the steps that remained. Rates are per step of the episodes as they would
+have been, so a step that counts for n violating ones is n steps long.
 """
 
 from __future__ import annotations
@@ -113,7 +118,8 @@ def evaluate(
 
     Args:
         env (EnvBase): batch size [\*N], with leaves of shape [\*N, 1] ``("next", "reward")``,
-            ``("next", "cost")``, ``("next", "violation")`` and ``("next", "goal_met")``.
+            ``("next", "cost")``, ``("next", "violation")`` or ``("next", "violations")``, and
+            ``("next", "goal_met")``.
         policy (callable): from tensordict to tensordict with the action. Put a policy with
             dropout or the like in ``eval()`` mode first.
 
@@ -126,8 +132,8 @@ def evaluate(
 
     Returns:
         TensorDict: batch size [\*N], float64, per episode: ``episode_return``, ``violations``
-        (steps), ``cv_rate`` and ``cost_rate`` (per step taken), ``score``, ``goals`` (steps that
-        met one), ``length`` (steps).
+        (steps), ``cv_rate`` and ``cost_rate`` (per step), ``score``, ``goals`` (steps that met
+        one), ``length`` (steps taken).
 
     Raises:
         ValueError: if ``num_steps`` is not positive, or a leaf has another shape.
@@ -147,7 +153,7 @@ def evaluate(
     """
     if num_steps < 1:
         raise ValueError(f"num_steps must be at least 1, got {num_steps}.")
-    names = ("reward", "cost", "violation", "goal_met", "length")
+    names = ("reward", "cost", "violations", "goal_met", "length", "duration")
     zero = torch.zeros(env.batch_size, dtype=torch.float64, device=env.device)
     total = {name: zero.clone() for name in names}
     running = torch.ones(env.batch_size, dtype=torch.bool, device=env.device)
@@ -159,19 +165,22 @@ def evaluate(
         td = env.reset()
         for _ in range(num_steps):
             stepped, td = env.step_and_maybe_reset(policy(td))
-            for name in ("reward", "cost", "violation", "goal_met"):
+            violations = _violations(stepped)
+            for name in ("reward", "cost", "goal_met"):
                 total[name] += _signal(stepped, ("next", name)).double().where(running, 0.0)
+            total["violations"] += violations.where(running, 0.0)
             total["length"] += running
+            total["duration"] += violations.clamp(min=1.0).where(running, 0.0)
             running = running & ~_signal(stepped, ("next", "done"))
             if not running.any():
                 break
     return TensorDict(
         {
             "episode_return": total["reward"],
-            "violations": total["violation"],
-            "cv_rate": total["violation"] / total["length"],
-            "score": score(total["reward"], total["violation"]),
-            "cost_rate": total["cost"] / total["length"],
+            "violations": total["violations"],
+            "cv_rate": total["violations"] / total["duration"],
+            "score": score(total["reward"], total["violations"]),
+            "cost_rate": total["cost"] / total["duration"],
             "goals": total["goal_met"],
             "length": total["length"],
         },
@@ -216,7 +225,8 @@ def count_violations(td: TensorDictBase) -> int:
     The total belongs to the caller, who saves it with the rest of a checkpoint.
 
     Args:
-        td (TensorDictBase): a batch with ``("next", "violation")``, e.g. batch size [N, T].
+        td (TensorDictBase): a batch with ``("next", "violation")`` or ``("next", "violations")``,
+            e.g. batch size [N, T].
 
     Returns:
         int: the number of violating steps.
@@ -235,7 +245,7 @@ def count_violations(td: TensorDictBase) -> int:
         >>> total_cvs
         42
     """
-    return int(_signal(td, ("next", "violation")).sum())
+    return int(_violations(td).sum())
 
 
 def batch_metrics(td: TensorDictBase, prefix: str = "train/") -> dict[str, float]:
@@ -243,7 +253,7 @@ def batch_metrics(td: TensorDictBase, prefix: str = "train/") -> dict[str, float
 
     Args:
         td (TensorDictBase): a batch with ``("next", "reward")``, ``("next", "cost")`` and
-            ``("next", "violation")``, e.g. batch size [N, T].
+            ``("next", "violation")`` or ``("next", "violations")``, e.g. batch size [N, T].
         prefix (str): put before every name. Defaults to ``"train/"``.
 
     Returns:
@@ -264,10 +274,10 @@ def batch_metrics(td: TensorDictBase, prefix: str = "train/") -> dict[str, float
     """
     if not td.batch_size.numel():
         raise ValueError(f"td must hold at least one step, got batch size {tuple(td.batch_size)}.")
-    means = [
-        _signal(td, ("next", name)).double().mean() for name in ("reward", "cost", "violation")
-    ]
-    reward, cost, violation = torch.stack(means).tolist()
+    signals = [_signal(td, ("next", name)).double() for name in ("reward", "cost")]
+    violations = _violations(td)
+    sums = torch.stack([signal.sum() for signal in (*signals, violations)])
+    reward, cost, violation = (sums / violations.clamp(min=1.0).sum()).tolist()
     return {
         f"{prefix}reward_per_1000": 1_000 * reward,
         f"{prefix}cost_rate": cost,
@@ -298,6 +308,12 @@ def acting(exploration_type: ExplorationType) -> Iterator[None]:
         torch.random.fork_rng(devices=devices),
     ):
         yield
+
+
+def _violations(td: TensorDictBase) -> Tensor:
+    """How many violating steps each step counts for, [*B], float64."""
+    name = "violations" if ("next", "violations") in td.keys(True) else "violation"
+    return _signal(td, ("next", name)).double()
 
 
 def _signal(td: TensorDictBase, key: NestedKey) -> Tensor:

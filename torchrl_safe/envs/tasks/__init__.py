@@ -2,7 +2,8 @@
 
 from torchrl_safe.envs.tasks.base import Objects, Outcome, Sensed, Task
 from torchrl_safe.envs.tasks.goal import GoalTask
+from torchrl_safe.envs.tasks.navigation import NavigationTask
 
-__all__ = ["TASKS", "GoalTask", "Objects", "Outcome", "Sensed", "Task"]
+__all__ = ["TASKS", "GoalTask", "NavigationTask", "Objects", "Outcome", "Sensed", "Task"]
 
-TASKS: dict[str, type[Task]] = {"goal": GoalTask}
+TASKS: dict[str, type[Task]] = {"goal": GoalTask, "navigation": NavigationTask}

@@ -1,24 +1,30 @@
-"""What a task is to the simulator behind the environments."""
+"""What a task is to the simulator behind the environments, and what tasks share."""
 
 from __future__ import annotations
 
-from typing import NamedTuple, Protocol
+from dataclasses import fields
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from torchrl_safe.envs._random import RandomStreams
-from torchrl_safe.envs.robots import Array, Motion, Robot
+from torchrl_safe.envs.robots import Array, Motion, Robot, to_robot_frame
 
 Objects = dict[str, Array]  # what a task remembers of N environments: arrays [N, ...] by name
 Mask = NDArray[np.bool_]
+
+# What the authors divide by, after shifting; the robot's own readings bring their scales with them.
+_DIRECTION_SCALE = 0.7
+_DISTANCE_SHIFT, _DISTANCE_SCALE = 1.5, 0.6
+_LIDAR_SHIFT, _LIDAR_SCALE = 0.3, 0.3
 
 
 class Sensed(NamedTuple):
     """What N robots meet where they are.
 
     Attributes:
-        scan (array): [N, R], readings of the lidar, before any noise.
+        scan (array): [N, R], readings of the lidar: 0 sees nothing, 1 is at the robot.
         cost (array): [N], of being here.
         violation (array): [N] bool, whether being here breaks the constraint.
         contact (array): [N] bool, whether the robot touches something it must not.
@@ -91,3 +97,92 @@ class Task(Protocol):
         self, robot: Robot, motion: Motion, objects: Objects, scan: Array
     ) -> NDArray[np.float32]:
         """The observation [N, D]."""
+
+
+def goal_reward(before: Array, after: Array, goal_radius: float) -> tuple[Array, Mask]:
+    """SafeTAC equation (19): progress to the goal, and one for reaching it.
+
+    ``before - after + 1[after <= goal_radius]``, both distances to the goal the step started with.
+    (As printed, the bonus reads the distance before the step; with a reached goal moved at once it
+    would never be paid.)
+
+    Args:
+        before (array): [N], distance to the goal before the step.
+        after (array): [N], distance to the same goal after it.
+        goal_radius (float): the goal is reached at this distance.
+
+    Returns:
+        tuple of arrays: reward [N] and whether the goal is reached [N].
+
+    Examples:
+        >>> import numpy as np
+        >>> goal_reward(np.array([1.0, 0.5]), np.array([0.75, 0.25]), 0.3)[0].tolist()
+        [0.25, 1.25]
+    """
+    reached = after <= goal_radius
+    return before - after + reached, reached
+
+
+def observe(
+    motion: Motion,
+    goal: Array,
+    scan: Array,
+    proprioception_scale: Array,
+    goal_range: float = np.inf,
+) -> NDArray[np.float32]:
+    """The observation, with the fixed scaling of the authors.
+
+    Goal direction in the robot frame / .7 (2), (goal distance - 1.5) / .6, proprioception / its
+    scale (P), (lidar - .3) / .3 (B).
+
+    Args:
+        motion (Motion): the robots.
+        goal (array): [N, 2].
+        scan (array): [N, B], the lidar.
+        proprioception_scale (array): [P].
+        goal_range (float): distances beyond this one look like it.
+
+    Returns:
+        array: [N, 3 + P + B], float32.
+    """
+    offset = goal - motion.position
+    distance = length(offset)
+    # A robot exactly on the goal has no direction to it: zero.
+    direction = offset / np.maximum(distance, 1e-12)[:, None]
+    size = motion.proprioception.shape[1]
+    out = np.empty((len(goal), 3 + size + scan.shape[1]), np.float32)
+    out[:, :2] = to_robot_frame(direction, motion.heading) / _DIRECTION_SCALE
+    out[:, 2] = (np.minimum(distance, goal_range) - _DISTANCE_SHIFT) / _DISTANCE_SCALE
+    out[:, 3 : 3 + size] = motion.proprioception / proprioception_scale
+    out[:, 3 + size :] = (scan - _LIDAR_SHIFT) / _LIDAR_SCALE
+    return out
+
+
+def length(vector: Array) -> Array:
+    """Lengths [...] of vectors [..., 2]."""
+    return np.hypot(vector[..., 0], vector[..., 1])
+
+
+def check_options(task: Any, smallest: dict[str, int]) -> None:
+    """Checks a task's options by the types of their defaults.
+
+    Args:
+        task (dataclass): the task; its other numbers must be positive and finite.
+        smallest (dict of int): what each count must be at least.
+
+    Raises:
+        TypeError: if a count is no integer or a switch no bool.
+        ValueError: if a number is out of range.
+    """
+    for field in fields(task):
+        name, value = field.name, getattr(task, field.name)
+        if isinstance(field.default, bool):
+            if not isinstance(value, bool):
+                raise TypeError(f"{name} must be a bool, got {value!r}.")
+        elif isinstance(field.default, int):
+            if not isinstance(value, int) or isinstance(value, bool):
+                raise TypeError(f"{name} must be an int, got {value!r}.")
+            if value < smallest[name]:
+                raise ValueError(f"{name} must be at least {smallest[name]}, got {value}.")
+        elif not isinstance(value, (int, float)) or not 0.0 < value < np.inf:
+            raise ValueError(f"{name} must be positive and finite, got {value!r}.")

@@ -7,7 +7,7 @@ and the reward of SafeTAC, equation (19).
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,16 +15,19 @@ from scipy.special import expit
 
 from torchrl_safe.envs._random import RandomStreams
 from torchrl_safe.envs.robots import Array, Motion, Robot, to_robot_frame
-from torchrl_safe.envs.tasks.base import Objects, Outcome, Sensed
+from torchrl_safe.envs.tasks.base import (
+    Objects,
+    Outcome,
+    Sensed,
+    check_options,
+    goal_reward,
+    length,
+    observe,
+)
 
 _LAYOUT_CANDIDATES = 32  # positions tried for one object before its layout is started again
 _LAYOUT_ATTEMPTS = 100  # layouts started before giving up
 _GOAL_CANDIDATES = 256  # positions tried for a goal that moves during an episode
-
-# What the authors divide by, after shifting; the robot's own readings bring their scales with them.
-_DIRECTION_SCALE = 0.7
-_DISTANCE_SHIFT, _DISTANCE_SCALE = 1.5, 0.6
-_LIDAR_SHIFT, _LIDAR_SCALE = 0.3, 0.3
 
 
 @dataclass(frozen=True)
@@ -41,6 +44,7 @@ class GoalTask:
         lidar_bins (int): angular bins of the lidar, B.
         lidar_range (float): distance at which the lidar reads zero.
         cost_slope (float): steepness of the cost at a hazard's rim, per metre.
+        binary_cost (bool): whether the cost is 1 inside a hazard and 0 outside instead.
 
     Raises:
         TypeError: if a count is no integer.
@@ -60,19 +64,11 @@ class GoalTask:
     lidar_bins: int = 16
     lidar_range: float = 3.0
     cost_slope: float = 10.0
+    binary_cost: bool = False
 
     def __post_init__(self) -> None:
-        for field in fields(self):
-            name, value = field.name, getattr(self, field.name)
-            if isinstance(field.default, int):
-                # With two bins or fewer the two neighbours of a bin coincide.
-                smallest = {"num_hazards": 0, "lidar_bins": 3}[name]
-                if not isinstance(value, int) or isinstance(value, bool):
-                    raise TypeError(f"{name} must be an int, got {value!r}.")
-                if value < smallest:
-                    raise ValueError(f"{name} must be at least {smallest}, got {value}.")
-            elif not isinstance(value, (int, float)) or not 0.0 < value < np.inf:
-                raise ValueError(f"{name} must be positive and finite, got {value!r}.")
+        # With two bins or fewer the two neighbours of a bin coincide.
+        check_options(self, smallest={"num_hazards": 0, "lidar_bins": 3})
         if self.goal_keepout >= self.extent:
             raise ValueError(
                 f"goal_keepout must be smaller than extent={self.extent}, got {self.goal_keepout}."
@@ -97,7 +93,7 @@ class GoalTask:
     ) -> tuple[Array, Array, Objects]:
         """See :func:`sample_layout`; the objects are goal, its distance, and hazards."""
         position, yaw, goal, hazards = sample_layout(self, robot.keepout, streams, rows)
-        distance = _norm(goal - position)
+        distance = length(goal - position)
         return position, yaw, {"goal": goal, "goal_distance": distance, "hazards": hazards}
 
     def sense(self, robot: Robot, motion: Motion, objects: Objects) -> Sensed:
@@ -117,14 +113,14 @@ class GoalTask:
     ) -> Outcome:
         """The reward to the goal the step started with; a reached goal moves."""
         goal, hazards = objects["goal"], objects["hazards"]
-        distance = _norm(goal - motion.position)
-        reward, goal_met = goal_reward(self, objects["goal_distance"], distance)
+        distance = length(goal - motion.position)
+        reward, goal_met = goal_reward(objects["goal_distance"], distance, self.goal_radius)
         if goal_met.any():
             rows = np.flatnonzero(goal_met)
             position = motion.position[rows]
             goal = goal.copy()
             goal[rows] = sample_goal(self, robot.keepout, position, hazards[rows], streams, rows)
-            distance[rows] = _norm(goal[rows] - position)
+            distance[rows] = length(goal[rows] - position)
         return Outcome(
             {"goal": goal, "goal_distance": distance, "hazards": hazards},
             reward,
@@ -224,9 +220,9 @@ def sample_goal(
     """
     draws = streams.uniform(rows, 2 * _GOAL_CANDIDATES).reshape(-1, _GOAL_CANDIDATES, 2)
     candidates = (draws * 2.0 - 1.0) * (task.extent - task.goal_keepout)
-    clearance = _norm(candidates - robot[:, None]) - robot_keepout
+    clearance = length(candidates - robot[:, None]) - robot_keepout
     if task.num_hazards:
-        to_hazards = _norm(candidates[:, :, None] - hazards[:, None]).min(-1) - task.hazard_keepout
+        to_hazards = length(candidates[:, :, None] - hazards[:, None]).min(-1) - task.hazard_keepout
         clearance = np.minimum(clearance, to_hazards)
     legal = clearance >= task.goal_keepout
     choice = np.where(legal.any(-1), legal.argmax(-1), clearance.argmax(-1))
@@ -236,7 +232,7 @@ def sample_goal(
 def hazard_distances(position: Array, hazards: Array) -> tuple[Array, Array]:
     """Offsets [N, H, 2] and distances [N, H] from the robots [N, 2] to the hazards [N, H, 2]."""
     offset = hazards - position[:, None]
-    return offset, _norm(offset)
+    return offset, length(offset)
 
 
 def lidar(task: GoalTask, offset: Array, distance: Array, heading: Array) -> Array:
@@ -276,27 +272,10 @@ def lidar(task: GoalTask, offset: Array, distance: Array, heading: Array) -> Arr
     return scan[:, 1:-2]
 
 
-def goal_reward(task: GoalTask, before: Array, after: Array) -> tuple[Array, NDArray[np.bool_]]:
-    """SafeTAC equation (19): progress to the goal, and one for reaching it.
-
-    ``before - after + 1[after <= goal_radius]``, both distances to the goal the step started with.
-    (As printed, the bonus reads the distance before the step; with a reached goal moved at once it
-    would never be paid.)
-
-    Args:
-        task (GoalTask): the options.
-        before (array): [N], distance to the goal before the step.
-        after (array): [N], distance to the same goal after it.
-
-    Returns:
-        tuple of arrays: reward [N] and whether the goal is reached [N].
-    """
-    reached = after <= task.goal_radius
-    return before - after + reached, reached
-
-
 def hazard_cost(task: GoalTask, distance: Array) -> tuple[Array, NDArray[np.bool_]]:
     """SafeTAC equation (19): ``sigmoid(cost_slope (hazard_radius - d))`` of the nearest hazard.
+
+    With ``binary_cost``, 1 inside a hazard and 0 outside, as in Safety Gym.
 
     Args:
         task (GoalTask): the options.
@@ -306,38 +285,7 @@ def hazard_cost(task: GoalTask, distance: Array) -> tuple[Array, NDArray[np.bool
         tuple of arrays: cost [N] in [0, 1], and whether the robot is inside a hazard [N].
     """
     nearest = distance.min(-1, initial=np.inf)
-    return expit(task.cost_slope * (task.hazard_radius - nearest)), nearest <= task.hazard_radius
-
-
-def observe(
-    motion: Motion, goal: Array, scan: Array, proprioception_scale: Array
-) -> NDArray[np.float32]:
-    """The observation, with the fixed scaling of the authors.
-
-    Goal direction in the robot frame / .7 (2), (goal distance - 1.5) / .6, proprioception / its
-    scale (P), (lidar - .3) / .3 (B).
-
-    Args:
-        motion (Motion): the robots.
-        goal (array): [N, 2].
-        scan (array): [N, B], the lidar.
-        proprioception_scale (array): [P].
-
-    Returns:
-        array: [N, 3 + P + B], float32.
-    """
-    offset = goal - motion.position
-    distance = _norm(offset)
-    # A robot exactly on the goal has no direction to it: zero.
-    direction = offset / np.maximum(distance, 1e-12)[:, None]
-    size = motion.proprioception.shape[1]
-    out = np.empty((len(goal), 3 + size + scan.shape[1]), np.float32)
-    out[:, :2] = to_robot_frame(direction, motion.heading) / _DIRECTION_SCALE
-    out[:, 2] = (distance - _DISTANCE_SHIFT) / _DISTANCE_SCALE
-    out[:, 3 : 3 + size] = motion.proprioception / proprioception_scale
-    out[:, 3 + size :] = (scan - _LIDAR_SHIFT) / _LIDAR_SCALE
-    return out
-
-
-def _norm(vector: Array) -> Array:
-    return np.hypot(vector[..., 0], vector[..., 1])
+    violation = nearest <= task.hazard_radius
+    if task.binary_cost:
+        return violation.astype(float), violation
+    return expit(task.cost_slope * (task.hazard_radius - nearest)), violation

@@ -339,6 +339,13 @@ class Core:
         """A copy of the generalised position [nq] of one environment."""
         return self._robots.batch.bind("qpos")[index].copy()
 
+    def scan(self, index: int) -> Array:
+        """The lidar's readings [R] in one environment, without noise."""
+        row = slice(index, index + 1)
+        motion = Motion(*(part[row] for part in self._robots.motion))
+        objects = {name: value[row] for name, value in self._objects.items()}
+        return self.task.sense(self.robot, motion, objects).scan[0]
+
     @property
     def frame(self) -> Frame:
         """The current frame."""

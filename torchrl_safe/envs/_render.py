@@ -6,6 +6,8 @@ import atexit
 import os
 import sys
 import weakref
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import mujoco
@@ -54,12 +56,14 @@ class SceneRenderer:
         self._camera.azimuth, self._camera.elevation = 90.0, _ELEVATION
         self._camera.distance = _camera_distance(core)
         self._view = mujoco.MjvScene(self.scene.model, maxgeom=_MAX_GEOMS)
-        self._gl = _Window(width, height) if window else _offscreen_context(width, height)
-        self._gl.make_current()
-        font = mujoco.mjtFontScale.mjFONTSCALE_100
-        self._context = mujoco.MjrContext(self.scene.model, font)
         buffer = mujoco.mjtFramebuffer
-        mujoco.mjr_setBuffer(buffer.mjFB_WINDOW if window else buffer.mjFB_OFFSCREEN, self._context)
+        with _visit():
+            self._gl = _Window(width, height) if window else _offscreen_context(width, height)
+            self._gl.make_current()
+            font = mujoco.mjtFontScale.mjFONTSCALE_100
+            self._context = mujoco.MjrContext(self.scene.model, font)
+            target = buffer.mjFB_WINDOW if window else buffer.mjFB_OFFSCREEN
+            mujoco.mjr_setBuffer(target, self._context)
         self._free = weakref.finalize(self, _free, self._gl, self._context)
         # Before MuJoCo shuts EGL down, which it registered when it was loaded.
         self._free.atexit = False
@@ -78,25 +82,25 @@ class SceneRenderer:
         )
         for end in scene.ray_ends(index):
             self._add_ray(np.array([*robot, _RAY_HEIGHT]), np.array([*end, _RAY_HEIGHT]))
-        # Another renderer may have made its own current.
-        self._gl.make_current()
         width, height = self._gl.framebuffer_size if self._window else self.size
         viewport = mujoco.MjrRect(0, 0, width, height)
-        mujoco.mjr_render(viewport, self._view, self._context)
-        cost, violation = core.frame.cost[index], core.frame.violation[index]
-        mujoco.mjr_overlay(
-            mujoco.mjtFont.mjFONT_NORMAL,
-            mujoco.mjtGridPos.mjGRID_TOPLEFT,
-            viewport,
-            "cost\nviolation",
-            f"{cost:.2f}\n{'yes' if violation else 'no'}",
-            self._context,
-        )
-        if self._window:
-            self._gl.show()
-            return None
-        picture = np.empty((height, width, 3), np.uint8)
-        mujoco.mjr_readPixels(picture, None, viewport, self._context)
+        with _visit():
+            self._gl.make_current()
+            mujoco.mjr_render(viewport, self._view, self._context)
+            cost, violation = core.frame.cost[index], core.frame.violation[index]
+            mujoco.mjr_overlay(
+                mujoco.mjtFont.mjFONT_NORMAL,
+                mujoco.mjtGridPos.mjGRID_TOPLEFT,
+                viewport,
+                "cost\nviolation",
+                f"{cost:.2f}\n{'yes' if violation else 'no'}",
+                self._context,
+            )
+            if self._window:
+                self._gl.show()
+                return None
+            picture = np.empty((height, width, 3), np.uint8)
+            mujoco.mjr_readPixels(picture, None, viewport, self._context)
         return np.flipud(picture).copy()
 
     def close(self) -> None:
@@ -186,6 +190,7 @@ def _scene_model(core: Core, width: int, height: int) -> mujoco.MjModel:
     if floor is None:
         floor = world.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE)
     floor.size, floor.material, floor.rgba = (50.0, 50.0, 0.1), "floor", (1.0,) * 4
+    floor.group = 0
     world.add_light(pos=(0.0, -2.0, 5.0), dir=(0.0, 0.4, -1.0), diffuse=(0.4,) * 3)
     distance, tilt = _camera_distance(core), np.deg2rad(-_ELEVATION)
     world.add_camera(
@@ -268,7 +273,30 @@ class _Window:
 
 
 def _free(gl: Any, context: mujoco.MjrContext) -> None:
-    # Freed while another context is current, it would take that one's textures with it.
-    gl.make_current()
-    context.free()
-    gl.free()
+    with _visit():
+        # Freed while another context is current, it would take that one's textures with it.
+        gl.make_current()
+        context.free()
+        gl.free()
+
+
+@contextmanager
+def _visit() -> Iterator[None]:
+    """Leaves current whichever EGL context was.
+
+    MuJoCo's contexts stay current after use, and none is after one is opened or freed; dm_control
+    draws without asking whether its own still is.
+    """
+    egl: Any = sys.modules.get("OpenGL.EGL")
+    context = egl.eglGetCurrentContext() if egl else None
+    if context:
+        display = egl.eglGetCurrentDisplay()
+        surfaces = [egl.eglGetCurrentSurface(end) for end in (egl.EGL_DRAW, egl.EGL_READ)]
+    try:
+        yield
+    finally:
+        egl = sys.modules.get("OpenGL.EGL")
+        if context:
+            egl.eglMakeCurrent(display, *surfaces, context)
+        elif egl:
+            egl.eglReleaseThread()

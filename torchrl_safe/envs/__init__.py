@@ -4,6 +4,8 @@ Importing this package registers the environments with Gymnasium. The dm_control
 by those who use it: ``from torchrl_safe.envs import suite``.
 """
 
+from torchrl_safe.envs.adapters import CostToReward, cost_from_info
+from torchrl_safe.envs.checks import check_safe_env
 from torchrl_safe.envs.goal import SafeGoalEnv
 from torchrl_safe.envs.gymnasium import GymGoalEnv, GymGoalVectorEnv, register_envs
 from torchrl_safe.envs.randomization import JACKAL_REAL, JACKAL_TRAINING, Randomization
@@ -14,6 +16,7 @@ __all__ = [
     "JACKAL_REAL",
     "JACKAL_TRAINING",
     "ROBOTS",
+    "CostToReward",
     "GoalTask",
     "GymGoalEnv",
     "GymGoalVectorEnv",
@@ -21,6 +24,8 @@ __all__ = [
     "Randomization",
     "Robot",
     "SafeGoalEnv",
+    "check_safe_env",
+    "cost_from_info",
     "get_robot",
 ]
 

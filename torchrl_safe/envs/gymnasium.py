@@ -16,6 +16,7 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from torchrl_safe.envs._core import Core, Frame, Mask, make_core
+from torchrl_safe.envs.randomization import Randomization
 from torchrl_safe.envs.robots import ROBOTS, Array, Robot
 from torchrl_safe.envs.tasks import Task
 
@@ -47,6 +48,7 @@ class GymGoalEnv(gymnasium.Env[NDArray[Any], NDArray[Any]]):
 
     Keyword Args:
         task (Task, optional): the task with its options. Default: that of the robot.
+        randomization (Randomization, optional): how the robots differ from their model.
         episode_length (int): steps until truncation. Gymnasium's own ``max_episode_steps`` works
             too, but the task does not know of it. Default: 1000.
         render_mode (str, optional): ``"rgb_array"``, ``"human"`` (a window) or ``None``.
@@ -74,13 +76,20 @@ class GymGoalEnv(gymnasium.Env[NDArray[Any], NDArray[Any]]):
         robot: str | Robot = "point",
         *,
         task: Task | None = None,
+        randomization: Randomization | None = None,
         episode_length: int = 1000,
         render_mode: str | None = None,
         width: int = 480,
         height: int = 360,
     ) -> None:
         self._core = make_core(
-            robot, task, num_envs=1, num_threads=1, seed=None, episode_length=episode_length
+            robot,
+            task,
+            num_envs=1,
+            num_threads=1,
+            seed=None,
+            episode_length=episode_length,
+            randomization=randomization,
         )
         self.metadata = _checked_metadata(type(self).metadata, self._core, render_mode)
         self.render_mode = render_mode
@@ -203,6 +212,7 @@ class GymGoalVectorEnv(gymnasium.vector.VectorEnv[NDArray[Any], NDArray[Any], ND
         num_envs (int): number of environments, N. Default: 64.
         num_threads (int): simulator threads. Default: 2.
         task (Task, optional): the task with its options. Default: that of the robot.
+        randomization (Randomization, optional): how the robots differ from their model.
         episode_length (int): steps until truncation. Default: 1000.
         stagger (bool): start the episodes of a full reset at different phases. Default: ``False``.
         autoreset_mode (AutoresetMode or str): Default: ``NEXT_STEP``, as in Gymnasium.
@@ -236,6 +246,7 @@ class GymGoalVectorEnv(gymnasium.vector.VectorEnv[NDArray[Any], NDArray[Any], ND
         num_envs: int = 64,
         num_threads: int = 2,
         task: Task | None = None,
+        randomization: Randomization | None = None,
         episode_length: int = 1000,
         stagger: bool = False,
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
@@ -252,6 +263,7 @@ class GymGoalVectorEnv(gymnasium.vector.VectorEnv[NDArray[Any], NDArray[Any], ND
             seed=None,
             episode_length=episode_length,
             stagger=stagger,
+            randomization=randomization,
         )
         self.metadata = _checked_metadata(type(self).metadata, self._core, render_mode)
         self.metadata["autoreset_mode"] = self.autoreset_mode

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from torchrl_safe.envs._core import Core, make_core
 from torchrl_safe.envs._render import Scene
+from torchrl_safe.envs.randomization import Randomization
 from torchrl_safe.envs.robots import Array, Robot
 from torchrl_safe.envs.tasks import Task
 
@@ -34,6 +35,7 @@ def load(
     *,
     random: int | np.random.RandomState | None = None,
     episode_length: int = 1000,
+    randomization: Randomization | None = None,
 ) -> control.Environment:
     """An environment of dm_control's reinforcement-learning suite, with a cost.
 
@@ -51,6 +53,7 @@ def load(
         random (int, RandomState, optional): seed of the episodes. ``None`` takes one from the
             operating system.
         episode_length (int): steps until the time limit. Default: 1000.
+        randomization (Randomization, optional): how the robot differs from its model.
 
     Returns:
         dm_control.rl.control.Environment: for dm_control's viewer, and for TorchRL's
@@ -77,6 +80,7 @@ def load(
         num_threads=1,
         seed=None,
         episode_length=episode_length,
+        randomization=randomization,
     )
     return control.Environment(
         Physics(core), SafeTask(core, random), n_sub_steps=core.robot.substeps

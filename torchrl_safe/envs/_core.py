@@ -295,7 +295,8 @@ class Core:
         if not np.isfinite(action).all():
             bad = np.flatnonzero(~np.isfinite(action).all(-1))
             raise ValueError(f"action must be finite; it is not in environments {bad.tolist()}.")
-        failed = self._robots.step(np.clip(action, -1.0, 1.0))
+        # In float64, whatever the face: a command computed in float32 would be another one.
+        failed = self._robots.step(np.clip(action.astype(np.float64), -1.0, 1.0))
         self.instabilities += int(failed.sum())
         self._elapsed += 1
         remaining = np.maximum(self.episode_length - self._elapsed, 0)

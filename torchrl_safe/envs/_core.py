@@ -295,7 +295,8 @@ class Core:
         if not np.isfinite(action).all():
             bad = np.flatnonzero(~np.isfinite(action).all(-1))
             raise ValueError(f"action must be finite; it is not in environments {bad.tolist()}.")
-        failed = self._robots.step(np.clip(action, -1.0, 1.0))
+        # In float64, whatever the face: a command computed in float32 would be another one.
+        failed = self._robots.step(np.clip(action.astype(np.float64), -1.0, 1.0))
         self.instabilities += int(failed.sum())
         self._elapsed += 1
         remaining = np.maximum(self.episode_length - self._elapsed, 0)
@@ -338,6 +339,13 @@ class Core:
     def qpos(self, index: int) -> Array:
         """A copy of the generalised position [nq] of one environment."""
         return self._robots.batch.bind("qpos")[index].copy()
+
+    def scan(self, index: int) -> Array:
+        """The lidar's readings [R] in one environment, without noise."""
+        row = slice(index, index + 1)
+        motion = Motion(*(part[row] for part in self._robots.motion))
+        objects = {name: value[row] for name, value in self._objects.items()}
+        return self.task.sense(self.robot, motion, objects).scan[0]
 
     @property
     def frame(self) -> Frame:

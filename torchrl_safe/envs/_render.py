@@ -1,109 +1,179 @@
-"""Pictures of the goal task: its own MuJoCo model, with hazards, goal, floor and light."""
+"""Pictures of the environments: a MuJoCo model of their own, with the task's objects in it."""
 
 from __future__ import annotations
 
+import atexit
 import os
 import sys
+import weakref
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from torchrl_safe.envs.robots import Array, Robot
-from torchrl_safe.envs.tasks import GoalTask
+from torchrl_safe.envs._core import Core
+from torchrl_safe.envs.robots import Array
+from torchrl_safe.envs.tasks import Prop
 
-_GOAL = (0.15, 0.75, 0.30, 0.45)
-_HAZARD = (0.20, 0.35, 0.90, 0.55)
-_HAZARD_ENTERED = (1.0, 0.10, 0.10, 0.90)
+_RED = (1.0, 0.10, 0.10, 0.90)
+_RAY = (0.95, 0.75, 0.10, 0.60)
+_RAY_HEIGHT = 0.12  # metres above the floor
+_ELEVATION = -70.0  # degrees, of the camera
+_MAX_GEOMS = 1000
 
 
 class SceneRenderer:
-    """Draws one environment from above; hazards turn red while the robot is inside one.
+    """Draws environments of a core, one at a time, from above.
 
-    Shadows and reflections are off: they halve the frame rate of a software renderer.
+    It shows the robot, the task's objects, the lidar's rays to what they hit, the cost of the last
+    step, and whether it violated the constraint; the nearest hazard turns red while it does.
 
     Args:
-        robot (Robot): the robot.
-        task (GoalTask): the options of the task.
+        core (Core): the environments.
         width (int): pixels, W.
         height (int): pixels, H.
+        window (bool): draw in a window instead of in memory.
 
     Raises:
         ValueError: if the size is not positive.
+        RuntimeError: if a window is asked for and there is no display.
     """
 
-    def __init__(self, robot: Robot, task: GoalTask, width: int, height: int) -> None:
+    def __init__(self, core: Core, width: int, height: int, *, window: bool = False) -> None:
         if width < 1 or height < 1:
             raise ValueError(f"width and height must be positive, got {width} and {height}.")
         self.size = (width, height)
-        self._extent = task.extent
-        self._model = _scene(robot, task, width, height)
-        self._data = mujoco.MjData(self._model)
-        self._hazards = [self._model.geom(f"hazard{i}").id for i in range(task.num_hazards)]
+        self._core = core
+        self._window = window
+        self.scene = Scene(core, width, height)
         self._option = mujoco.MjvOption()
         self._option.flags[mujoco.mjtVisFlag.mjVIS_ACTUATOR] = False
         self._camera = mujoco.MjvCamera()
         self._camera.type = mujoco.mjtCamera.mjCAMERA_FREE
-        self._camera.azimuth, self._camera.elevation = 90.0, -70.0
-        # Far enough to see the square and the objects at its rim.
-        self._camera.distance = 2.8 * task.extent
-        self._scene = mujoco.MjvScene(self._model, maxgeom=200 + task.num_hazards)
-        self._scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = False
-        self._scene.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = False
-        self._gl = _gl_context(width, height)
-        self._gl.make_current()
-        self._context = mujoco.MjrContext(self._model, mujoco.mjtFontScale.mjFONTSCALE_100)
-        mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._context)
+        self._camera.azimuth, self._camera.elevation = 90.0, _ELEVATION
+        self._camera.distance = _camera_distance(core)
+        self._view = mujoco.MjvScene(self.scene.model, maxgeom=_MAX_GEOMS)
+        buffer = mujoco.mjtFramebuffer
+        with _visit():
+            self._gl = _Window(width, height) if window else _offscreen_context(width, height)
+            self._gl.make_current()
+            font = mujoco.mjtFontScale.mjFONTSCALE_100
+            self._context = mujoco.MjrContext(self.scene.model, font)
+            target = buffer.mjFB_WINDOW if window else buffer.mjFB_OFFSCREEN
+            mujoco.mjr_setBuffer(target, self._context)
+        self._free = weakref.finalize(self, _free, self._gl, self._context)
+        # Before MuJoCo shuts EGL down, which it registered when it was loaded.
+        self._free.atexit = False
+        atexit.register(self._free)
 
-    def draw(self, qpos: Array, layout: dict[str, Array], violation: bool) -> NDArray[np.uint8]:
-        """A picture of the robot at ``qpos`` [nq] in a layout: [H, W, 3]."""
-        model, data = self._model, self._data
-        data.qpos[:] = qpos
-        data.mocap_pos[:, :2] = np.concatenate((layout["goal"][None], layout["hazards"]))
-        mujoco.mj_kinematics(model, data)
-        mujoco.mj_comPos(model, data)
-        mujoco.mj_camlight(model, data)
-        if self._hazards:
-            model.geom_rgba[self._hazards] = _HAZARD
-            if violation:
-                nearest = np.linalg.norm(layout["hazards"] - layout["robot"], axis=-1).argmin()
-                model.geom_rgba[self._hazards[nearest]] = _HAZARD_ENTERED
+    def draw(self, index: int) -> NDArray[np.uint8] | None:
+        """A picture of environment ``index``, [H, W, 3]; ``None`` if it went to a window."""
+        scene, core = self.scene, self._core
+        scene.show(index)
         # The square stays in view until the robot leaves it; then the camera goes with it.
-        inside = np.clip(layout["robot"], -self._extent, self._extent)
-        self._camera.lookat[:2] = layout["robot"] - inside
+        robot, extent = core.layout(index)["robot"], core.task.extent
+        self._camera.lookat[:2] = robot - np.clip(robot, -extent, extent)
+        everything = mujoco.mjtCatBit.mjCAT_ALL
         mujoco.mjv_updateScene(
-            model, data, self._option, None, self._camera, mujoco.mjtCatBit.mjCAT_ALL, self._scene
+            scene.model, scene.data, self._option, None, self._camera, everything, self._view
         )
-        width, height = self.size
-        picture = np.empty((height, width, 3), np.uint8)
+        for end in scene.ray_ends(index):
+            self._add_ray(np.array([*robot, _RAY_HEIGHT]), np.array([*end, _RAY_HEIGHT]))
+        width, height = self._gl.framebuffer_size if self._window else self.size
         viewport = mujoco.MjrRect(0, 0, width, height)
-        self._gl.make_current()
-        mujoco.mjr_render(viewport, self._scene, self._context)
-        mujoco.mjr_readPixels(picture, None, viewport, self._context)
+        with _visit():
+            self._gl.make_current()
+            mujoco.mjr_render(viewport, self._view, self._context)
+            cost, violation = core.frame.cost[index], core.frame.violation[index]
+            mujoco.mjr_overlay(
+                mujoco.mjtFont.mjFONT_NORMAL,
+                mujoco.mjtGridPos.mjGRID_TOPLEFT,
+                viewport,
+                "cost\nviolation",
+                f"{cost:.2f}\n{'yes' if violation else 'no'}",
+                self._context,
+            )
+            if self._window:
+                self._gl.show()
+                return None
+            picture = np.empty((height, width, 3), np.uint8)
+            mujoco.mjr_readPixels(picture, None, viewport, self._context)
         return np.flipud(picture).copy()
 
     def close(self) -> None:
         """Frees the GL context: while it lives, another renderer's pictures can be black."""
-        self._context.free()
-        self._gl.free()
+        atexit.unregister(self._free)
+        self._free()
+
+    def _add_ray(self, start: Array, end: Array) -> None:
+        view, line = self._view, mujoco.mjtGeom.mjGEOM_LINE
+        geom = view.geoms[view.ngeom]
+        blank, turn = np.zeros(3), np.eye(3).ravel()
+        mujoco.mjv_initGeom(geom, line, blank, blank, turn, np.array(_RAY, np.float32))
+        mujoco.mjv_connector(geom, line, 2.0, start, end)
+        view.ngeom += 1
 
 
-def _scene(robot: Robot, task: GoalTask, width: int, height: int) -> mujoco.MjModel:
-    """The robot's model, dressed: mocap bodies in the order goal, hazards."""
-    spec = mujoco.MjSpec.from_file(str(robot.asset_path))
-    spec.visual.global_.offwidth, spec.visual.global_.offheight = width, height
-    spec.visual.headlight.ambient = (0.45,) * 3
-    spec.visual.headlight.diffuse = (0.35,) * 3
-    spec.add_texture(
-        name="sky",
-        type=mujoco.mjtTexture.mjTEXTURE_SKYBOX,
-        builtin=mujoco.mjtBuiltin.mjBUILTIN_GRADIENT,
-        rgb1=(0.85, 0.90, 0.95),
-        rgb2=(0.60, 0.70, 0.80),
-        width=64,
-        height=384,
-    )
+class Scene:
+    """The model that is drawn: the robot's own, dressed with floor, light and the task's objects.
+
+    Args:
+        core (Core): the environments.
+        width (int): the widest picture, pixels.
+        height (int): the highest picture, pixels.
+
+    Attributes:
+        model (mujoco.MjModel): positions of the objects are mocap bodies.
+        data (mujoco.MjData): what :meth:`show` wrote.
+    """
+
+    def __init__(self, core: Core, width: int = 640, height: int = 480) -> None:
+        self._core = core
+        self.model = _scene_model(core, width, height)
+        self.data = mujoco.MjData(self.model)
+        self._hazards = [
+            i for i in range(self.model.ngeom) if self.model.geom(i).name.startswith("hazard")
+        ]
+        self._colours = self.model.geom_rgba[self._hazards].copy()
+
+    def show(self, index: int) -> None:
+        """Puts robot and objects where they are in environment ``index``."""
+        core, model, data = self._core, self.model, self.data
+        layout = core.layout(index)
+        data.qpos[:] = core.qpos(index)
+        data.mocap_pos[:, :2] = np.concatenate([_places(prop, layout) for prop in core.task.props])
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_comPos(model, data)
+        mujoco.mj_camlight(model, data)
+        if self._hazards:
+            model.geom_rgba[self._hazards] = self._colours
+            if core.frame.violation[index]:
+                offset = data.geom_xpos[self._hazards, :2] - layout["robot"]
+                nearest = np.hypot(*offset.T).argmin()
+                model.geom_rgba[self._hazards[nearest]] = _RED
+
+    def ray_ends(self, index: int) -> Array:
+        """Where the lidar's rays of environment ``index`` hit something: [K, 2]."""
+        core, layout = self._core, self._core.layout(index)
+        angle, distance = core.task.rays(core.scan(index))
+        x, y = layout["heading"]
+        ahead = np.stack((np.cos(angle), np.sin(angle)), -1) * distance[:, None]
+        return layout["robot"] + ahead @ np.array([[x, y], [-y, x]])
+
+
+def _scene_model(core: Core, width: int, height: int) -> mujoco.MjModel:
+    spec = mujoco.MjSpec.from_file(str(core.robot.asset_path))
+    spec.option.timestep = core.robot.timestep
+    visual = spec.visual
+    visual.global_.offwidth, visual.global_.offheight = width, height
+    visual.headlight.ambient = (0.45,) * 3
+    visual.headlight.diffuse = (0.35,) * 3
+    # A software renderer spends most of its time on smooth edges and shadows.
+    visual.quality.offsamples = 0
+    visual.quality.shadowsize = 0
     spec.add_texture(
         name="floor",
         type=mujoco.mjtTexture.mjTEXTURE_2D,
@@ -113,32 +183,120 @@ def _scene(robot: Robot, task: GoalTask, width: int, height: int) -> mujoco.MjMo
         width=256,
         height=256,
     )
-    floor = spec.add_material(name="floor", texuniform=True, texrepeat=(2.0, 2.0))
-    floor.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = "floor"
+    material = spec.add_material(name="floor", texuniform=True, texrepeat=(2.0, 2.0))
+    material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = "floor"
     world = spec.worldbody
-    white = (1.0, 1.0, 1.0, 1.0)
-    plane = mujoco.mjtGeom.mjGEOM_PLANE
-    world.add_geom(type=plane, size=(50.0, 50.0, 0.1), material="floor", rgba=white)
+    floor = next((geom for geom in spec.geoms if geom.type == mujoco.mjtGeom.mjGEOM_PLANE), None)
+    if floor is None:
+        floor = world.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE)
+    floor.size, floor.material, floor.rgba = (50.0, 50.0, 0.1), "floor", (1.0,) * 4
+    floor.group = 0
     world.add_light(pos=(0.0, -2.0, 5.0), dir=(0.0, 0.4, -1.0), diffuse=(0.4,) * 3)
-    discs = [("goal", task.goal_radius, _GOAL)]
-    discs += [(f"hazard{i}", task.hazard_radius, _HAZARD) for i in range(task.num_hazards)]
-    for name, radius, colour in discs:
-        body = world.add_body(name=name, mocap=True, pos=(0.0, 0.0, 0.01))
-        body.add_geom(
-            name=name,
-            type=mujoco.mjtGeom.mjGEOM_CYLINDER,
-            size=(radius, 0.01, 0.0),
-            rgba=colour,
-        )
+    distance, tilt = _camera_distance(core), np.deg2rad(-_ELEVATION)
+    world.add_camera(
+        name="overview",
+        pos=(0.0, -distance * np.cos(tilt), distance * np.sin(tilt)),
+        xyaxes=(1.0, 0.0, 0.0, 0.0, np.sin(tilt), np.cos(tilt)),
+    )
+    layout = core.layout(0)
+    shapes = {"disc": mujoco.mjtGeom.mjGEOM_CYLINDER, "box": mujoco.mjtGeom.mjGEOM_BOX}
+    for number, prop in enumerate(core.task.props):
+        for i in range(len(_places(prop, layout))):
+            # It stands on the floor.
+            body = world.add_body(mocap=True, pos=(0.0, 0.0, prop.size[-1]))
+            body.add_geom(
+                name=f"{'hazard' if prop.hazard else 'prop'}{number}:{i}",
+                type=shapes[prop.shape],
+                size=(*prop.size, 0.0)[:3],
+                rgba=prop.colour,
+                contype=0,
+                conaffinity=0,
+            )
     return spec.compile()
 
 
-def _gl_context(width: int, height: int) -> Any:
+def _places(prop: Prop, layout: dict[str, Array]) -> Array:
+    """Positions [K, 2] of a prop's objects."""
+    places = layout[prop.objects] if isinstance(prop.objects, str) else np.array(prop.objects)
+    return places.reshape(-1, 2)
+
+
+def _camera_distance(core: Core) -> float:
+    # Far enough to see the square and the objects at its rim.
+    return 2.8 * core.task.extent
+
+
+def _offscreen_context(width: int, height: int) -> Any:
     """MuJoCo's context for ``MUJOCO_GL``; EGL on a Linux without it and without a display."""
     # MuJoCo chooses when it is imported, long before we know that anybody wants to draw.
     headless = sys.platform == "linux" and not os.environ.get("DISPLAY")
-    if headless and not os.environ.get("MUJOCO_GL"):
+    if headless and os.environ.get("MUJOCO_GL", "") in ("", "egl"):
         from mujoco.egl import GLContext
     else:
         from mujoco.gl_context import GLContext
     return GLContext(width, height)
+
+
+class _Window:
+    """An OpenGL context in a window; closing the window ends the drawing, not the program."""
+
+    def __init__(self, width: int, height: int) -> None:
+        displays = ("DISPLAY", "WAYLAND_DISPLAY")
+        if sys.platform == "linux" and not any(os.environ.get(name) for name in displays):
+            raise RuntimeError(
+                'there is no display to open a window on: use render_mode="rgb_array".'
+            )
+        import glfw
+
+        self._glfw = glfw
+        if not glfw.init():
+            raise RuntimeError('GLFW could not start: use render_mode="rgb_array".')
+        self._window = glfw.create_window(width, height, "torchrl_safe", None, None)
+        if not self._window:
+            raise RuntimeError('no window could be opened: use render_mode="rgb_array".')
+
+    def make_current(self) -> None:
+        self._glfw.make_context_current(self._window)
+
+    @property
+    def framebuffer_size(self) -> tuple[int, int]:
+        return self._glfw.get_framebuffer_size(self._window)
+
+    def show(self) -> None:
+        if self._glfw.window_should_close(self._window):
+            self._glfw.hide_window(self._window)
+        self._glfw.swap_buffers(self._window)
+        self._glfw.poll_events()
+
+    def free(self) -> None:
+        self._glfw.destroy_window(self._window)
+
+
+def _free(gl: Any, context: mujoco.MjrContext) -> None:
+    with _visit():
+        # Freed while another context is current, it would take that one's textures with it.
+        gl.make_current()
+        context.free()
+        gl.free()
+
+
+@contextmanager
+def _visit() -> Iterator[None]:
+    """Leaves current whichever EGL context was.
+
+    MuJoCo's contexts stay current after use, and none is after one is opened or freed; dm_control
+    draws without asking whether its own still is.
+    """
+    egl: Any = sys.modules.get("OpenGL.EGL")
+    context = egl.eglGetCurrentContext() if egl else None
+    if context:
+        display = egl.eglGetCurrentDisplay()
+        surfaces = [egl.eglGetCurrentSurface(end) for end in (egl.EGL_DRAW, egl.EGL_READ)]
+    try:
+        yield
+    finally:
+        egl = sys.modules.get("OpenGL.EGL")
+        if context:
+            egl.eglMakeCurrent(display, *surfaces, context)
+        elif egl:
+            egl.eglReleaseThread()

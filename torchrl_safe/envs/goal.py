@@ -16,7 +16,7 @@ from torchrl.envs import EnvBase
 from torchrl_safe.envs._core import Frame, make_core
 from torchrl_safe.envs.randomization import Randomization
 from torchrl_safe.envs.robots import Robot
-from torchrl_safe.envs.tasks import GoalTask, Task
+from torchrl_safe.envs.tasks import Task
 
 
 class SafeGoalEnv(EnvBase):
@@ -194,7 +194,7 @@ class SafeGoalEnv(EnvBase):
         return self._core.layout(self._checked(index))
 
     def render(self, index: int = 0, width: int = 480, height: int = 360) -> NDArray[np.uint8]:
-        """A picture of one environment from above.
+        """A picture of one environment from above: robot, goal, hazards, lidar and cost.
 
         Without ``MUJOCO_GL`` and a display, it is drawn by EGL, which needs no screen.
 
@@ -217,15 +217,8 @@ class SafeGoalEnv(EnvBase):
             self._renderer.close()
             self._renderer = None
         if self._renderer is None:
-            task = self._core.task
-            if not isinstance(task, GoalTask):
-                raise NotImplementedError(f"there is no picture of {task} yet.")
-            self._renderer = SceneRenderer(self._core.robot, task, width, height)
-        return self._renderer.draw(
-            self._core.qpos(index),
-            self._core.layout(index),
-            bool(self._core.frame.violation[index]),
-        )
+            self._renderer = SceneRenderer(self._core, width, height)
+        return self._renderer.draw(index)
 
     def _checked(self, index: int) -> int:
         if not 0 <= index < self.batch_size[0]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import fields
-from typing import Any, NamedTuple, Protocol
+from typing import Any, Literal, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -56,6 +56,25 @@ class Outcome(NamedTuple):
     terminated: Mask
 
 
+class Prop(NamedTuple):
+    """How a picture shows some of a task's objects.
+
+    Attributes:
+        objects (str or tuple): their name, an array of positions [N, 2] or [N, K, 2]; or fixed
+            positions [K, 2].
+        shape (str): ``"disc"`` or ``"box"``.
+        size (tuple of float): radius and half the height, or half sizes along x, y and z; metres.
+        colour (tuple of float): red, green, blue, opacity.
+        hazard (bool): whether the nearest of them turns red during a violation.
+    """
+
+    objects: str | tuple[tuple[float, float], ...]
+    shape: Literal["disc", "box"]
+    size: tuple[float, ...]
+    colour: tuple[float, float, float, float]
+    hazard: bool = False
+
+
 class Task(Protocol):
     """A task: the options of an environment and what follows from them, over a batch.
 
@@ -66,6 +85,21 @@ class Task(Protocol):
     @property
     def max_cost(self) -> float:
         """The largest cost of a step."""
+
+    @property
+    def extent(self) -> float:
+        """Half the side of the square that matters, in metres: what a picture shows."""
+
+    @property
+    def props(self) -> tuple[Prop, ...]:
+        """What a picture shows besides the robot."""
+
+    def rays(self, scan: Array) -> tuple[Array, Array]:
+        """Angles to the left of ahead and lengths in metres, [K] each, of beams that hit something.
+
+        Args:
+            scan (array): [R], the lidar's readings in one environment.
+        """
 
     def observation_size(self, robot: Robot) -> int:
         """Length D of the observation."""

@@ -18,6 +18,7 @@ from torchrl_safe.envs.robots import Array, Motion, Robot, to_robot_frame
 from torchrl_safe.envs.tasks.base import (
     Objects,
     Outcome,
+    Prop,
     Sensed,
     check_options,
     goal_reward,
@@ -83,6 +84,20 @@ class GoalTask:
     def max_cost(self) -> float:
         """The largest cost of a step."""
         return 1.0
+
+    @property
+    def props(self) -> tuple[Prop, ...]:
+        """The goal in green, hazards in blue, flat."""
+        return (
+            Prop("goal", "disc", (self.goal_radius, 0.01), (0.15, 0.75, 0.30, 0.45)),
+            Prop("hazards", "disc", (self.hazard_radius, 0.01), (0.20, 0.35, 0.90, 0.55), True),
+        )
+
+    def rays(self, scan: Array) -> tuple[Array, Array]:
+        """A beam through the middle of each bin that reads something."""
+        hit = np.flatnonzero(scan > 0.0)
+        turn = 2.0 * np.pi / self.lidar_bins
+        return turn * (hit.astype(np.float64) + 0.5), (1.0 - scan[hit]) * self.lidar_range
 
     def observation_size(self, robot: Robot) -> int:
         """Goal direction (2) and distance (1), proprioception, lidar."""

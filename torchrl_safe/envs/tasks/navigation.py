@@ -21,6 +21,7 @@ from torchrl_safe.envs.tasks.base import (
     Mask,
     Objects,
     Outcome,
+    Prop,
     Sensed,
     check_options,
     goal_reward,
@@ -94,6 +95,28 @@ class NavigationTask:
     def max_cost(self) -> float:
         """The largest cost of a step: a contact with endless steps remaining."""
         return 1.0 / (1.0 - self.discount)
+
+    @property
+    def extent(self) -> float:
+        """The boxes' part of the room; the walls are further away."""
+        return self.grid_extent + self.box_half_size
+
+    @property
+    def props(self) -> tuple[Prop, ...]:
+        """The goal in green and flat, boxes and walls."""
+        half, far = self.box_half_size, self.wall_distance
+        grey, thick, high = (0.45, 0.45, 0.50, 1.0), 0.05, 0.25
+        return (
+            Prop("goal", "disc", (self.goal_radius, 0.01), (0.15, 0.75, 0.30, 0.45)),
+            Prop("boxes", "box", (half, half, half), (0.20, 0.35, 0.90, 1.0), True),
+            Prop(((0.0, far + thick), (0.0, -far - thick)), "box", (far, thick, high), grey),
+            Prop(((far + thick, 0.0), (-far - thick, 0.0)), "box", (thick, far, high), grey),
+        )
+
+    def rays(self, scan: Array) -> tuple[Array, Array]:
+        """The rays that meet something."""
+        rays = _lidar(self).rays[scan > 0.0]
+        return np.arctan2(rays[:, 1], rays[:, 0]), (1.0 - scan[scan > 0.0]) * self.lidar_range
 
     def observation_size(self, robot: Robot) -> int:
         """Goal direction (2) and distance (1), proprioception, lidar."""

@@ -1,0 +1,221 @@
+"""The contract: all of ours keep it, and each clause can fail."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torchrl.data import Binary, Composite, Unbounded
+from torchrl.envs import RewardSum, SerialEnv, TransformedEnv
+
+from torchrl_safe.envs import ROBOTS, SafeGoalEnv, check_safe_env
+
+
+def make(cls=SafeGoalEnv, num_envs=4, num_threads=1, episode_length=9, **options):
+    return cls(
+        "point",
+        num_envs=num_envs,
+        num_threads=num_threads,
+        episode_length=episode_length,
+        **options,
+    )
+
+
+@pytest.mark.parametrize("robot", ROBOTS)
+def test_ours(robot):
+    env, twin = (
+        SafeGoalEnv(robot, num_envs=3, num_threads=threads, episode_length=9) for threads in (1, 2)
+    )
+    check_safe_env(env, twins=[twin], time_limit=9)
+    check_safe_env(SafeGoalEnv(robot, num_envs=1, num_threads=1))
+
+
+def test_transformed_and_nested():
+    sums = RewardSum(in_keys=["reward", "cost"], out_keys=["return", "costs"])
+    check_safe_env(TransformedEnv(make(), sums), time_limit=9)
+    check_safe_env(SerialEnv(2, make), time_limit=9)
+
+
+def test_says_nothing(capfd):
+    check_safe_env(make())
+    assert capfd.readouterr() == ("", "")
+
+
+class NoCost(SafeGoalEnv):
+    """The cost is an observation, as in TorchRL's SafetyGymnasiumEnv."""
+
+    def __init__(self, *args, **kwargs):
+        super().__init__(*args, **kwargs)
+        self.observation_spec["cost"] = Unbounded((*self.batch_size, 1))
+        self.full_reward_spec = Composite(
+            reward=self.full_reward_spec["reward"], shape=self.batch_size
+        )
+
+    def _reset(self, tensordict=None, **kwargs):
+        td = super()._reset(tensordict, **kwargs)
+        return td.set("cost", torch.zeros(*self.batch_size, 1))
+
+
+class DoubleCost(SafeGoalEnv):
+    def __init__(self, *args, **kwargs):
+        super().__init__(*args, **kwargs)
+        spec = Unbounded((*self.batch_size, 1), dtype=torch.float64)
+        self.full_reward_spec = Composite(
+            reward=self.full_reward_spec["reward"], cost=spec, shape=self.batch_size
+        )
+
+    def _step(self, tensordict):
+        td = super()._step(tensordict)
+        return td.set("cost", td["cost"].double())
+
+
+class NoViolation(SafeGoalEnv):
+    def __init__(self, *args, **kwargs):
+        super().__init__(*args, **kwargs)
+        del self.observation_spec["violation"]
+
+    def _to_tensordict(self, frame, rewards):
+        return super()._to_tensordict(frame, rewards).exclude("violation")
+
+
+class NumberViolation(SafeGoalEnv):
+    def __init__(self, *args, **kwargs):
+        super().__init__(*args, **kwargs)
+        self.observation_spec["violation"] = Binary(1, (*self.batch_size, 1), dtype=torch.int64)
+
+    def _to_tensordict(self, frame, rewards):
+        td = super()._to_tensordict(frame, rewards)
+        return td.set("violation", td["violation"].long())
+
+
+class Stepping(SafeGoalEnv):
+    """Lets ``spoil`` change what every step returns."""
+
+    def _step(self, tensordict):
+        return self.spoil(super()._step(tensordict))
+
+
+class NotFinite(Stepping):
+    def spoil(self, td):
+        return td.set("observation", td["observation"].log())
+
+
+class DoneAlone(Stepping):
+    def spoil(self, td):
+        return td.set("truncated", torch.zeros_like(td["done"]))
+
+
+class Terminates(Stepping):
+    """A time limit that is passed off as an end of the task."""
+
+    def spoil(self, td):
+        td["terminated"] = td["terminated"] | td["truncated"]
+        return td.set("truncated", torch.zeros_like(td["done"]))
+
+
+class TerminatesToo(Stepping):
+    def spoil(self, td):
+        return td.set("terminated", td["terminated"] | td["truncated"])
+
+
+class Unseeded(SafeGoalEnv):
+    def _set_seed(self, seed):
+        pass
+
+
+class Remembers(Stepping):
+    """Noise from a generator that no seed reaches."""
+
+    def spoil(self, td):
+        if not hasattr(self, "noise"):
+            self.noise = torch.Generator().manual_seed(0)
+        noise = torch.rand(td["reward"].shape, generator=self.noise)
+        return td.set("reward", td["reward"] + noise)
+
+
+class Reuses(Stepping):
+    """One buffer for all observations."""
+
+    def spoil(self, td):
+        if not hasattr(self, "buffer"):
+            self.buffer = torch.empty_like(td["observation"])
+        return td.set("observation", self.buffer.copy_(td["observation"]))
+
+
+class ResetsAll(SafeGoalEnv):
+    def _reset(self, tensordict=None, **kwargs):
+        return super()._reset(None, **kwargs)
+
+
+class ResetsNone(SafeGoalEnv):
+    def _reset(self, tensordict=None, **kwargs):
+        if tensordict is not None and not tensordict["_reset"].all():
+            tensordict = tensordict.set("_reset", torch.zeros_like(tensordict["_reset"]))
+        return super()._reset(tensordict, **kwargs)
+
+
+class SharedStream(SafeGoalEnv):
+    """A reset of some takes a draw from the streams of the others."""
+
+    def _reset(self, tensordict=None, **kwargs):
+        td = super()._reset(tensordict, **kwargs)
+        self._core._streams.state += 1
+        return td
+
+
+class HalfAState(SafeGoalEnv):
+    def load_state_dict(self, state_dict, **kwargs):
+        kept = dict(self.state_dict())
+        super().load_state_dict({**state_dict, "elapsed": kept["elapsed"]})
+
+
+@pytest.mark.parametrize(
+    ("cls", "message"),
+    [
+        (NoCost, r"'cost' must be among \['reward'\]"),
+        (DoubleCost, r"'cost' must be torch.float32 \(4, 1\), its spec says torch.float64"),
+        (NoViolation, "'violation' must be among"),
+        (NumberViolation, r"'violation' must be torch.bool \(4, 1\), its spec says torch.int64"),
+        (NotFinite, "'observation' must be finite, it is not at"),
+        (DoneAlone, r"done must be terminated \| truncated, it is not in"),
+        (Terminates, "a time limit of 9 must truncate at step 9"),
+        (TerminatesToo, "a time limit truncates and does not terminate"),
+        (Remembers, "the same seed and actions give another rollout: .*reward"),
+        (Unseeded, "the same seed and actions give another rollout"),
+        (Reuses, "returned tensors are written to by later steps"),
+        (ResetsAll, "a partial reset after step 10 changes step .* of those it leaves alone"),
+        (ResetsNone, "a partial reset changes nothing where it was asked to reset"),
+        (SharedStream, "a partial reset after step 10 changes step .* of those it leaves alone"),
+        (HalfAState, r"load_state_dict\(state_dict\(\)\) is no way back"),
+    ],
+)
+def test_each_clause_can_fail(cls, message):
+    with pytest.raises(AssertionError, match=message):
+        check_safe_env(make(cls), time_limit=9)
+
+
+def test_torchrls_own_check_comes_first():
+    class WrongShape(Stepping):
+        def spoil(self, td):
+            return td.set("goal_met", td["goal_met"].float())
+
+    with pytest.raises(AssertionError):
+        check_safe_env(make(WrongShape))
+
+
+def test_twins():
+    with pytest.raises(AssertionError, match="twin 1 gives another rollout"):
+        check_safe_env(make(), twins=[make(), make(episode_length=5)])
+
+
+def test_early_time_limit():
+    with pytest.raises(AssertionError, match="before the limit of 9"):
+        check_safe_env(make(episode_length=9, stagger=True), time_limit=9)
+    with pytest.raises(AssertionError, match="must truncate at step 5"):
+        check_safe_env(make(episode_length=9), time_limit=5)
+
+
+def test_options():
+    check_safe_env(make(NoViolation), violation_key=None)
+    for bad in ({"num_steps": 0}, {"time_limit": 0}):
+        with pytest.raises(ValueError, match="must be positive, got 0"):
+            check_safe_env(make(), **bad)

@@ -1,0 +1,442 @@
+"""The Gymnasium face of the environments: ``gymnasium.make`` and ``gymnasium.make_vec``.
+
+Importing ``torchrl_safe.envs`` registers ``torchrl_safe/PointGoal-v0`` and its siblings, one per
+entry of ``ROBOTS``.
+"""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium.vector import AutoresetMode
+from gymnasium.vector.utils import batch_space
+from numpy.typing import NDArray
+
+from torchrl_safe.envs._core import Core, Frame, Mask, make_core
+from torchrl_safe.envs.randomization import Randomization
+from torchrl_safe.envs.robots import ROBOTS, Array, Robot
+from torchrl_safe.envs.tasks import Task
+
+__all__ = ["GymGoalEnv", "GymGoalVectorEnv", "register_envs"]
+
+_NO_RENDER_MODE = "render() draws nothing: make the environment with a render_mode."
+_INFO = ("cost", "violation", "violations", "goal_met")
+
+# The core truncates a simulation long before: MuJoCo takes a position, velocity or acceleration
+# beyond 1e10 for diverged, and no reading is scaled up by more than 100. The bound is there because
+# Gymnasium's checker warns of an unbounded space.
+_BOUND = np.float32(1e12)
+
+
+class GymGoalEnv(gymnasium.Env[NDArray[Any], NDArray[Any]]):
+    """One robot and its task as a :class:`gymnasium.Env`, with the cost in ``info``.
+
+    Steps are those of :class:`~torchrl_safe.envs.SafeGoalEnv` with one environment and the same
+    seed. A time limit is ``truncated``, a collision ``terminated``. ``info`` holds, after a step as
+    after a reset, NumPy scalars:
+
+    * ``cost`` (float64);
+    * ``violation`` (bool), inside a hazard or in contact;
+    * ``violations`` (int64), how many violating steps this one counts for;
+    * ``goal_met`` (bool), goal reached in this step.
+
+    Args:
+        robot (str or Robot): the robot, or its name in ``ROBOTS``. Default: ``"point"``.
+
+    Keyword Args:
+        task (Task, optional): the task with its options. Default: that of the robot.
+        randomization (Randomization, optional): how the robots differ from their model.
+        episode_length (int): steps until truncation. Gymnasium's own ``max_episode_steps`` works
+            too, but the task does not know of it. Default: 1000.
+        render_mode (str, optional): ``"rgb_array"``, ``"human"`` (a window) or ``None``.
+        width (int): pixels of a picture. Default: 480.
+        height (int): pixels of a picture. Default: 360.
+
+    Raises:
+        ValueError: if the robot or the render mode is unknown, an option is out of range, or the
+            objects do not fit.
+
+    Examples:
+        >>> import gymnasium
+        >>> import torchrl_safe.envs
+        >>> env = gymnasium.make("torchrl_safe/PointGoal-v0")
+        >>> observation, info = env.reset(seed=0)
+        >>> observation, reward, terminated, truncated, info = env.step(env.action_space.sample())
+        >>> sorted(info)
+        ['cost', 'goal_met', 'violation', 'violations']
+    """
+
+    metadata: dict[str, Any] = {"render_modes": ["rgb_array", "human"]}  # noqa: RUF012
+
+    def __init__(
+        self,
+        robot: str | Robot = "point",
+        *,
+        task: Task | None = None,
+        randomization: Randomization | None = None,
+        episode_length: int = 1000,
+        render_mode: str | None = None,
+        width: int = 480,
+        height: int = 360,
+    ) -> None:
+        self._core = make_core(
+            robot,
+            task,
+            num_envs=1,
+            num_threads=1,
+            seed=None,
+            episode_length=episode_length,
+            randomization=randomization,
+        )
+        self.metadata = _checked_metadata(type(self).metadata, self._core, render_mode)
+        self.render_mode = render_mode
+        self.observation_space, self.action_space = _spaces(self._core)
+        self._size = (width, height)
+        self._renderer: Any = None
+        self._drawn_at = 0.0
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[NDArray[np.float32], dict[str, Any]]:
+        """Starts an episode; a seed starts the sequence of episodes that belongs to it.
+
+        Args:
+            seed (int, optional): without one, the sequence goes on.
+            options (dict, optional): there are none.
+
+        Raises:
+            ValueError: if the seed is negative or there are options.
+        """
+        _no_options(options)
+        super().reset(seed=seed)
+        if seed is not None:
+            self._core.seed(seed)
+        frame = self._core.reset()
+        if self.render_mode == "human":
+            self.render()
+        return frame.observation[0].copy(), _scalars(frame)
+
+    def step(
+        self, action: NDArray[np.floating]
+    ) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
+        """Advances by one step.
+
+        Args:
+            action (array): [A]; components outside [-1, 1] are clipped.
+
+        Returns:
+            tuple: observation [D], reward, terminated, truncated, info.
+
+        Raises:
+            ValueError: if the action has another shape or is not finite; nothing has moved then.
+            RuntimeError: before the first reset.
+        """
+        action = _checked_action(action, self.action_space.shape)
+        frame = self._core.step(action[None])
+        if self.render_mode == "human":
+            self.render()
+        return (
+            frame.observation[0].copy(),
+            float(frame.reward[0]),
+            bool(frame.terminated[0]),
+            bool(frame.truncated[0]),
+            _scalars(frame),
+        )
+
+    def render(self) -> NDArray[np.uint8] | None:
+        """A picture [H, W, 3], or ``None`` after showing it in a window in real time.
+
+        Raises:
+            RuntimeError: if there is no display to open a window on.
+        """
+        if self.render_mode is None:
+            gymnasium.logger.warn(_NO_RENDER_MODE)
+            return None
+        from torchrl_safe.envs._render import SceneRenderer
+
+        human = self.render_mode == "human"
+        if self._renderer is None:
+            self._renderer = SceneRenderer(self._core, *self._size, window=human)
+        picture = self._renderer.draw(0)
+        if human:
+            # As fast as the robot moves, and no faster.
+            period = 1.0 / self.metadata["render_fps"]
+            time.sleep(max(0.0, self._drawn_at + period - time.monotonic()))
+            self._drawn_at = time.monotonic()
+        return picture
+
+    def layout(self) -> dict[str, Array]:
+        """Where things are: see :meth:`~torchrl_safe.envs.SafeGoalEnv.layout`."""
+        return self._core.layout(0)
+
+    def snapshot(self) -> dict[str, NDArray[Any]]:
+        """Copies of everything the future depends on."""
+        return self._core.snapshot()
+
+    def restore(self, snapshot: dict[str, NDArray[Any]]) -> None:
+        """Puts a snapshot back; what follows is what followed it.
+
+        Raises:
+            ValueError: if it is one of another robot or task; nothing has changed then.
+        """
+        self._core.restore(snapshot)
+
+    def close(self) -> None:
+        """Closes the window or the GL context."""
+        if self._renderer is not None:
+            self._renderer.close()
+            self._renderer = None
+
+
+class GymGoalVectorEnv(gymnasium.vector.VectorEnv[NDArray[Any], NDArray[Any], NDArray[Any]]):
+    """N environments on a thread pool as a :class:`gymnasium.vector.VectorEnv`.
+
+    ``infos`` holds the arrays ``cost``, ``violation``, ``violations`` and ``goal_met``, [N] each,
+    and Gymnasium's masks ``_cost``, ... of what is valid, here all of it. The autoreset mode says
+    what happens to environments whose episode is over:
+
+    * ``NEXT_STEP``: their next step ignores the action, resets them and returns reward 0;
+    * ``SAME_STEP``: they are reset at once. The observation is the new episode's; reward and
+      ``infos["cost"]`` are the ended one's last, as are ``infos["final_obs"]`` and
+      ``infos["final_info"]``;
+    * ``DISABLED``: ``reset(options={"reset_mask": mask})`` resets them. TorchRL's ``GymWrapper``
+      prefers this mode.
+
+    Args:
+        robot (str or Robot): the robot, or its name in ``ROBOTS``. Default: ``"point"``.
+
+    Keyword Args:
+        num_envs (int): number of environments, N. Default: 64.
+        num_threads (int): simulator threads. Default: 2.
+        task (Task, optional): the task with its options. Default: that of the robot.
+        randomization (Randomization, optional): how the robots differ from their model.
+        episode_length (int): steps until truncation. Default: 1000.
+        stagger (bool): start the episodes of a full reset at different phases. Default: ``False``.
+        autoreset_mode (AutoresetMode or str): Default: ``NEXT_STEP``, as in Gymnasium.
+        render_mode (str, optional): ``"rgb_array"`` or ``None``.
+        width (int): pixels of a picture. Default: 480.
+        height (int): pixels of a picture. Default: 360.
+
+    Raises:
+        ValueError: if the robot or a mode is unknown, an option is out of range, or the objects do
+            not fit.
+
+    Examples:
+        >>> import gymnasium
+        >>> import torchrl_safe.envs
+        >>> envs = gymnasium.make_vec("torchrl_safe/PointGoal-v0", num_envs=3, num_threads=1)
+        >>> observations, infos = envs.reset(seed=0)
+        >>> *_, infos = envs.step(envs.action_space.sample())
+        >>> infos["cost"].shape
+        (3,)
+    """
+
+    metadata: dict[str, Any] = {  # noqa: RUF012
+        "render_modes": ["rgb_array"],
+        "autoreset_mode": AutoresetMode.NEXT_STEP,
+    }
+
+    def __init__(
+        self,
+        robot: str | Robot = "point",
+        *,
+        num_envs: int = 64,
+        num_threads: int = 2,
+        task: Task | None = None,
+        randomization: Randomization | None = None,
+        episode_length: int = 1000,
+        stagger: bool = False,
+        autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
+        render_mode: str | None = None,
+        width: int = 480,
+        height: int = 360,
+    ) -> None:
+        self.autoreset_mode = AutoresetMode(autoreset_mode)
+        self._core = make_core(
+            robot,
+            task,
+            num_envs=num_envs,
+            num_threads=num_threads,
+            seed=None,
+            episode_length=episode_length,
+            stagger=stagger,
+            randomization=randomization,
+        )
+        self.metadata = _checked_metadata(type(self).metadata, self._core, render_mode)
+        self.metadata["autoreset_mode"] = self.autoreset_mode
+        self.render_mode = render_mode
+        self.num_envs = num_envs
+        self.single_observation_space, self.single_action_space = _spaces(self._core)
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
+        self.action_space = batch_space(self.single_action_space, num_envs)
+        self._over = np.zeros(num_envs, bool)
+        self._size = (width, height)
+        self._renderer: Any = None
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[NDArray[np.float32], dict[str, Any]]:
+        """Starts new episodes.
+
+        Args:
+            seed (int, optional): one for all; each environment has its own stream under it.
+            options (dict, optional): ``{"reset_mask": mask}``, [N] bool, resets those alone.
+
+        Raises:
+            TypeError: if the seed is a sequence.
+            ValueError: if the seed is negative, the mask is not a bool array [N], or there are
+                other options.
+        """
+        options = dict(options or {})
+        mask = options.pop("reset_mask", None)
+        _no_options(options)
+        if mask is not None:
+            mask = np.asarray(mask)
+            if mask.shape != (self.num_envs,) or mask.dtype != np.bool_:
+                raise ValueError(
+                    f"reset_mask must be a bool array of shape {(self.num_envs,)}, "
+                    f"got {mask.dtype} {mask.shape}."
+                )
+        if seed is not None and not isinstance(seed, (int, np.integer)):
+            raise TypeError(f"seed must be one integer or None, got {seed!r}.")
+        super().reset(seed=seed)
+        if seed is not None:
+            self._core.seed(seed)
+        frame = self._core.reset(mask)
+        self._over = self._over & ~mask if mask is not None else np.zeros(self.num_envs, bool)
+        return frame.observation.copy(), _arrays(frame)
+
+    def step(
+        self, actions: NDArray[np.floating]
+    ) -> tuple[NDArray[np.float32], Array, Mask, Mask, dict[str, Any]]:
+        """Advances all environments by one step.
+
+        Args:
+            actions (array): [N, A]; components outside [-1, 1] are clipped.
+
+        Returns:
+            tuple: observations [N, D], rewards [N], terminations [N], truncations [N], infos.
+
+        Raises:
+            ValueError: if the actions have another shape or are not finite; nothing has moved then.
+            RuntimeError: before the first reset, or if an episode is over and autoreset is off.
+        """
+        actions = _checked_action(actions, self.action_space.shape)
+        over = self._over
+        if over.any() and self.autoreset_mode is AutoresetMode.DISABLED:
+            rows = np.flatnonzero(over).tolist()
+            raise RuntimeError(f"reset environments {rows} first: their episodes are over.")
+        streams = self._core.snapshot()["random"] if over.any() else None
+        frame = self._core.step(actions)
+        if streams is not None:
+            # Those that are over made a step that nobody sees: it must not draw from their streams.
+            state = self._core.snapshot()
+            state["random"][over] = streams[over]
+            self._core.restore(state)
+            frame = self._core.reset(over)
+        done = frame.terminated | frame.truncated
+        infos = _arrays(frame)
+        observations = frame.observation
+        if self.autoreset_mode is AutoresetMode.SAME_STEP:
+            if done.any():
+                infos |= _final(frame, done)
+                observations = self._core.reset(done).observation
+        else:
+            self._over = done
+        return (
+            observations.copy(),
+            frame.reward.copy(),
+            frame.terminated.copy(),
+            frame.truncated.copy(),
+            infos,
+        )
+
+    def render(self) -> tuple[NDArray[np.uint8], ...] | None:
+        """A picture [H, W, 3] of each environment."""
+        if self.render_mode is None:
+            gymnasium.logger.warn(_NO_RENDER_MODE)
+            return None
+        from torchrl_safe.envs._render import SceneRenderer
+
+        if self._renderer is None:
+            self._renderer = SceneRenderer(self._core, *self._size)
+        return tuple(self._renderer.draw(index) for index in range(self.num_envs))
+
+    def close_extras(self, **kwargs: Any) -> None:
+        """Frees the GL context."""
+        if self._renderer is not None:
+            self._renderer.close()
+            self._renderer = None
+
+
+def register_envs() -> None:
+    """Registers an id for each robot with Gymnasium: ``torchrl_safe/<Robot>Goal-v0``."""
+    for name in ROBOTS:
+        gymnasium.register(
+            f"torchrl_safe/{name.capitalize()}Goal-v0",
+            entry_point="torchrl_safe.envs.gymnasium:GymGoalEnv",
+            vector_entry_point="torchrl_safe.envs.gymnasium:GymGoalVectorEnv",
+            kwargs={"robot": name},
+        )
+
+
+def _spaces(core: Core) -> tuple[gymnasium.spaces.Box, gymnasium.spaces.Box]:
+    """Of observations [D] and actions [A], float32."""
+    return (
+        gymnasium.spaces.Box(-_BOUND, _BOUND, (core.observation_size,), np.float32),
+        gymnasium.spaces.Box(-1.0, 1.0, (core.action_dim,), np.float32),
+    )
+
+
+def _checked_metadata(
+    metadata: dict[str, Any], core: Core, render_mode: str | None
+) -> dict[str, Any]:
+    modes = metadata["render_modes"]
+    if render_mode is not None and render_mode not in modes:
+        raise ValueError(f"render_mode must be None or one of {modes}, got {render_mode!r}.")
+    seconds = core.robot.timestep * core.robot.substeps
+    return metadata | {"render_fps": round(1.0 / seconds)}
+
+
+def _checked_action(action: Any, shape: tuple[int, ...] | None) -> Array:
+    action = np.asarray(action)
+    if action.shape != shape or action.dtype.kind not in "fiu":
+        raise ValueError(
+            f"action must be numbers of shape {shape}, got {action.dtype} {action.shape}."
+        )
+    return action
+
+
+def _no_options(options: dict[str, Any] | None) -> None:
+    if options:
+        raise ValueError(f"unknown reset options: {sorted(options)}.")
+
+
+def _scalars(frame: Frame) -> dict[str, Any]:
+    return {name: getattr(frame, name)[0] for name in _INFO}
+
+
+def _arrays(frame: Frame) -> dict[str, Any]:
+    values = {name: getattr(frame, name).copy() for name in _INFO}
+    return values | {f"_{name}": np.ones(len(value), bool) for name, value in values.items()}
+
+
+def _final(frame: Frame, done: Mask) -> dict[str, Any]:
+    """Gymnasium's entries of the episodes that ended: arrays [N], valid where the masks are set."""
+    last = np.full(len(done), None, object)
+    for row in np.flatnonzero(done):
+        last[row] = frame.observation[row].copy()
+    info: dict[str, Any] = {}
+    for name in _INFO:
+        value = getattr(frame, name)
+        info[name] = np.where(done, value, np.zeros_like(value))
+        info[f"_{name}"] = done.copy()
+    return {
+        "final_obs": last,
+        "_final_obs": done.copy(),
+        "final_info": info,
+        "_final_info": done.copy(),
+    }

@@ -1,9 +1,8 @@
-"""Who acts: one process, several on this machine, or several anywhere, by ``collector.backend``."""
+"""Who acts: one process or several, by ``collector.backend``."""
 
 from __future__ import annotations
 
 import signal
-import sys
 from collections.abc import Callable
 from functools import partial
 
@@ -16,11 +15,10 @@ from torchrl.collectors import (
     MultiAsyncCollector,
     MultiSyncCollector,
 )
-from torchrl.collectors.distributed import RayCollector
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType
 
-BACKENDS = ("single", "multi_sync", "multi_async", "ray")
+BACKENDS = ("single", "multi_sync", "multi_async")
 
 
 def make_collector(
@@ -38,8 +36,6 @@ def make_collector(
     * ``multi_sync``: in ``collector.num_workers`` processes, which wait during an update.
     * ``multi_async``: the same without waiting: an update sees the batch of one worker,
       ``[N / num_workers, T]``, begun before the update that came before it.
-    * ``ray``: as ``multi_sync``, in workers of a Ray cluster: that at ``RAY_ADDRESS``, or a new one
-      on this machine. The package must be installed where they run.
 
     Call ``update_policy_weights_`` on it after every update.
 
@@ -76,24 +72,12 @@ def make_collector(
     creators: list[Callable[[], EnvBase]] = [
         partial(_in_worker, make_env, share, worker_seed(seed, i)) for i in range(num_workers)
     ]
-    if backend == "ray":
-        _pickle_by_value()
-        return RayCollector(creators, policy, sync=True, postproc=_joined, **options)
     options["auto_register_policy_transforms"] = False
     if backend == "multi_sync":
         return MultiSyncCollector(
             creators, policy, cat_results="stack", postproc=_joined, **options
         )
     return MultiAsyncCollector(creators, policy, **options)
-
-
-def _pickle_by_value() -> None:
-    """Examples are no package: Ray workers get the functions of these files with their code."""
-    from ray import cloudpickle
-
-    for name in (__name__, "utils"):
-        if name in sys.modules:
-            cloudpickle.register_pickle_by_value(sys.modules[name])
 
 
 def worker_seed(seed: int, worker: int) -> int:

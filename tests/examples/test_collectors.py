@@ -58,13 +58,10 @@ def collect(cfg, policy, seed, batches, **kwargs):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("backend", ["multi_sync", "ray"])
-def test_workers_see_what_collectors_of_one_process_see(backend, policy):
+def test_workers_see_what_collectors_of_one_process_see(policy):
     """Each worker's rows are those of a single collector with its seed, weights up to date."""
-    if backend == "ray":
-        pytest.importorskip("ray")
     greedy = {"exploration_type": ExplorationType.DETERMINISTIC}
-    together = collect(config(backend), policy, 5, 3, **greedy)
+    together = collect(config("multi_sync"), policy, 5, 3, **greedy)
     apart = config("single", num_envs=3)
     apart.collector.frames_per_batch = FRAMES // 2
     workers = [collect(apart, policy, worker_seed(5, i), 3, **greedy) for i in range(2)]

@@ -3,13 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from pathlib import Path
 
 import torch
 from omegaconf import DictConfig
 from tensordict import TensorDictBase
 from torch import nn
 from torchrl._utils import timeit
-from torchrl.data import LazyTensorStorage, SliceSampler, TensorDictReplayBuffer
+from torchrl.data import (
+    LazyMemmapStorage,
+    LazyTensorStorage,
+    SliceSampler,
+    Storage,
+    TensorDictReplayBuffer,
+)
 from torchrl.envs import EnvBase
 from utils import make_critic
 
@@ -69,9 +76,17 @@ def make_critic_optim(
 
 
 def make_buffer(cfg: DictConfig) -> TensorDictReplayBuffer:
-    """Replays slices of trajectories."""
+    """Replays slices of trajectories, from memory or from files in the run's folder."""
+    size, kind = cfg.replay_buffer.size, cfg.replay_buffer.storage
+    if kind == "memmap":
+        folder = Path(cfg.run_dir) / "replay"
+        storage: Storage = LazyMemmapStorage(size, scratch_dir=folder, existsok=True, ndim=2)
+    elif kind == "memory":
+        storage = LazyTensorStorage(size, ndim=2)
+    else:
+        raise ValueError(f"replay_buffer.storage must be memory or memmap, got {kind!r}.")
     return TensorDictReplayBuffer(
-        storage=LazyTensorStorage(cfg.replay_buffer.size, ndim=2),
+        storage=storage,
         sampler=SliceSampler(
             slice_len=cfg.replay_buffer.slice_len,
             traj_key=("collector", "traj_ids"),

@@ -7,18 +7,19 @@ import os
 import signal
 import time
 from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 from types import FrameType
 from typing import Any
 
 import torch
+from collectors import make_collector
 from omegaconf import DictConfig, OmegaConf
 from tensordict import TensorDictBase
 from torch import nn
 from torchrl._utils import logger as torchrl_logger
 from torchrl._utils import timeit
 from torchrl.checkpoint import Checkpoint, CheckpointRotation, GlobalRNGState
-from torchrl.collectors import Collector
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType
 from torchrl.modules import MLP, ValueOperator
@@ -102,21 +103,14 @@ def train(
         eval_env (EnvBase): environments of the evaluations during training.
     """
     cfg = run.cfg
-    env = make_env(
+    collector = make_collector(
         cfg,
-        cfg.env.num_envs,
-        seed=cfg.seed + run.frames,  # a resumed run sees new layouts
-        episode_length=cfg.env.episode_length,
-        stagger=True,
-    )
-    collector = Collector(
-        env,
+        partial(make_env, cfg, episode_length=cfg.env.episode_length, stagger=True),
         policy,
-        frames_per_batch=cfg.collector.frames_per_batch,
+        seed=cfg.seed + run.frames,  # a resumed run sees new layouts
         total_frames=cfg.collector.total_frames - run.frames,
-        exploration_type=ExplorationType.RANDOM,
-        auto_register_policy_transforms=False,
     )
+    collector.update_policy_weights_()  # workers start with what a checkpoint brought
     progress = tqdm(total=cfg.collector.total_frames, initial=run.frames, unit="frame")
     next_eval, next_save = (
         run.frames // interval * interval + interval
@@ -131,6 +125,7 @@ def train(
             metrics["train/total_cvs"] = run.counters["total_cvs"]
             metrics["train/entropy"] = -batch["action_log_prob"].mean().item()
             metrics |= update(batch)
+            collector.update_policy_weights_()
 
             if run.frames >= next_eval:
                 next_eval += cfg.eval.interval

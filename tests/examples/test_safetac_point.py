@@ -149,6 +149,23 @@ class TestResume:
             launch(tmp_path / "run", "resume=true")
 
 
+class TestReplay:
+    def test_memmap_learns_the_same_and_resumes(self, finished, tmp_path):
+        """Files in place of memory change no number, also across an interruption's checkpoint."""
+        run_dir = tmp_path / "run"
+        launch(run_dir, "collector.total_frames=1200", "replay_buffer.storage=memmap")
+        assert list((run_dir / "replay").glob("*.memmap"))
+        first, second = (record.read_metrics(path / "log") for path in (finished, run_dir))
+        for name in ("update/loss_qvalue", "update/kl", "train/total_cvs"):
+            torch.testing.assert_close(
+                first[name][1][:3], second[name][1], rtol=0, atol=0, msg=name
+            )
+        more = ["collector.total_frames=2000", "replay_buffer.storage=memmap", "resume=true"]
+        launch(run_dir, *more)
+        losses = record.read_metrics(run_dir / "log")["update/loss_qvalue"]
+        assert losses[0].tolist() == [400, 800, 1200, 1600, 2000]
+
+
 class TestLoggers:
     def test_tensorboard(self, tmp_path):
         launch(tmp_path / "run", "collector.total_frames=400", "logger.backend=tensorboard")
@@ -187,6 +204,7 @@ class TestMisuse:
             ("loss.entropic_index=0", "entropic_index must be"),
             ("optim.max_kl=0", "max_kl"),
             ("env.robot=unicycle", "unicycle"),
+            ("replay_buffer.storage=disk", "must be memory or memmap, got 'disk'"),
         ],
     )
     def test_message(self, tmp_path, override, message):

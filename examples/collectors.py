@@ -1,0 +1,98 @@
+"""Who acts: one process or several, by ``collector.backend``."""
+
+from __future__ import annotations
+
+import signal
+from collections.abc import Callable
+from functools import partial
+
+import torch
+from omegaconf import DictConfig
+from tensordict import TensorDictBase
+from torchrl.collectors import (
+    BaseCollector,
+    Collector,
+    MultiAsyncCollector,
+    MultiSyncCollector,
+)
+from torchrl.envs import EnvBase
+from torchrl.envs.utils import ExplorationType
+
+BACKENDS = ("single", "multi_sync", "multi_async")
+
+
+def make_collector(
+    cfg: DictConfig,
+    make_env: Callable[..., EnvBase],
+    policy: Callable[[TensorDictBase], TensorDictBase],
+    *,
+    seed: int,
+    total_frames: int,
+    exploration_type: ExplorationType = ExplorationType.RANDOM,
+) -> BaseCollector:
+    """A collector of batches ``[N, T]`` from ``env.num_envs`` environments.
+
+    * ``single``: in this process, before each update.
+    * ``multi_sync``: in ``collector.num_workers`` processes, which wait during an update.
+    * ``multi_async``: the same without waiting: an update sees the batch of one worker,
+      ``[N / num_workers, T]``, begun before the update that came before it.
+
+    Call ``update_policy_weights_`` on it after every update.
+
+    Args:
+        cfg (DictConfig): the run's configuration.
+        make_env (callable): makes environments from the keywords ``num_envs`` and ``seed``. Workers
+            receive a pickled copy.
+        policy (callable): acts.
+
+    Keyword Args:
+        seed (int): of the environments; workers derive theirs from it.
+        total_frames (int): when to stop.
+        exploration_type (ExplorationType): how the policy acts.
+
+    Raises:
+        ValueError: if the backend is unknown, or the workers cannot share the environments equally.
+    """
+    backend, num_workers = cfg.collector.backend, cfg.collector.num_workers
+    if backend not in BACKENDS:
+        raise ValueError(f"collector.backend must be one of {BACKENDS}, got {backend!r}.")
+    options = {
+        "frames_per_batch": cfg.collector.frames_per_batch,
+        "total_frames": total_frames,
+        "exploration_type": exploration_type,
+    }
+    if backend == "single":
+        env = make_env(num_envs=cfg.env.num_envs, seed=seed)
+        return Collector(env, policy, auto_register_policy_transforms=False, **options)
+    if num_workers < 1 or cfg.env.num_envs % num_workers:
+        raise ValueError(
+            f"collector.num_workers={num_workers} must divide env.num_envs={cfg.env.num_envs}."
+        )
+    share = cfg.env.num_envs // num_workers
+    creators: list[Callable[[], EnvBase]] = [
+        partial(_in_worker, make_env, share, worker_seed(seed, i)) for i in range(num_workers)
+    ]
+    options["auto_register_policy_transforms"] = False
+    if backend == "multi_sync":
+        return MultiSyncCollector(
+            creators, policy, cat_results="stack", postproc=_joined, **options
+        )
+    return MultiAsyncCollector(creators, policy, **options)
+
+
+def worker_seed(seed: int, worker: int) -> int:
+    """Seed of a worker's environments and draws; that of the first is the run's own."""
+    return seed + 7_919 * worker
+
+
+def _in_worker(make_env: Callable[..., EnvBase], num_envs: int, seed: int) -> EnvBase:
+    """Runs in a worker: what a process of its own needs besides environments."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C stops the learner, which stops workers
+    torch.set_num_threads(1)
+    torch.manual_seed(seed)  # or all workers would draw the same noise
+    return make_env(num_envs=num_envs, seed=seed)
+
+
+def _joined(batch: TensorDictBase) -> TensorDictBase:
+    """The workers' batches ``[W, N / W, T]`` as one, ``[N, T]``."""
+    return batch.flatten(0, 1)

@@ -1,0 +1,285 @@
+"""The controller inside Doggo: PPO teaches twelve motors to follow a local goal.
+
+    python examples/doggo_controller.py              # train, measure, export
+    python examples/doggo_controller.py resume=true  # go on after Ctrl-C
+
+The robot learns on the goal task without hazards: the direction to walk in is that of the goal, how
+fast is drawn anew every few seconds. What the package ships is the exported
+``controller.safetensors``. Every option is in doggo_controller.yaml beside this file.
+"""
+
+from __future__ import annotations
+
+import math
+import sys
+import time
+from pathlib import Path
+
+import hydra
+import torch
+from omegaconf import DictConfig
+from safetensors.torch import save_file
+from tensordict import TensorDictBase
+from tensordict.nn import AddStateIndependentNormalScale, TensorDictModule
+from torch import nn
+from torchrl._utils import logger as torchrl_logger
+from torchrl.collectors import Collector
+from torchrl.data import Composite, Unbounded
+from torchrl.envs import Transform, TransformedEnv
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+from torchrl.modules import MLP, ProbabilisticActor, TanhNormal, ValueOperator
+from torchrl.objectives import ClipPPOLoss
+from torchrl.objectives.value import GAE
+from tqdm import tqdm
+from utils import EVAL_SEED, GracefulStop, Run, use_threads
+
+from torchrl_safe.envs import GoalTask, SafeGoalEnv
+
+STEP = 0.1  # seconds
+# What the controller sees: direction (2) and length (1) of the local goal; the trunk's velocity
+# (3), angular velocity (3) and vertical (3); velocity, sine and cosine of 12 joints.
+INPUT = 48
+UPRIGHT = 11  # the vertical component of the trunk's z axis
+
+
+# Left and right of the robot: the same joints on the other side, and what changes its sign.
+LEGS = [3, 4, 5, 0, 1, 2, 9, 10, 11, 6, 7, 8]
+OTHER_SIDE = [*range(12), *(first + joint for first in (12, 24, 36) for joint in LEGS)]
+SIGNS = torch.tensor([1, -1, 1] + [1, -1, 1] + [-1, 1, -1] + [1, -1, 1] + [1] * 36)
+OTHER_MOTORS = [3, 2, 1, 0, 7, 6, 5, 4, 11, 10, 9, 8]
+USED = ["observation", "action", "action_log_prob", "advantage", "value_target"]
+
+
+class FollowCommand(Transform):
+    """Asks for a speed towards the goal, rewards it, and ends the episode of a robot on its back.
+
+    The observation shows the wanted speed (as a share of the top speed) in place of the goal's
+    distance. The reward is ``wanted - |progress - wanted|``, in metres per step.
+    """
+
+    def __init__(self, num_envs: int, top_speed: float, full_share: float, duration: float):
+        super().__init__()
+        self.top_speed, self.full_share, self.duration = top_speed, full_share, duration
+        self.register_buffer("length", torch.ones(num_envs, 1))
+
+    def _draw(self, renew: torch.Tensor) -> None:
+        full = torch.rand_like(self.length) < self.full_share
+        length = torch.where(full, 1.0, torch.rand_like(self.length))
+        self.length = torch.where(renew, length, self.length)
+
+    def _show(self, td: TensorDictBase) -> TensorDictBase:
+        observation = td["observation"].clone()
+        observation[:, 2:3] = self.length
+        return td.set("observation", observation)
+
+    def _reset(self, td: TensorDictBase, reset: TensorDictBase) -> TensorDictBase:
+        self._draw(td.get("_reset", torch.ones_like(reset["done"])) if td is not None else True)
+        reset["along"] = torch.zeros_like(self.length)
+        return self._show(reset)
+
+    def _step(self, td: TensorDictBase, following: TensorDictBase) -> TensorDictBase:
+        observation = following["observation"]
+        wanted = self.length * self.top_speed * STEP
+        along = following["reward"] - following["goal_met"].float()
+        following["along"] = along
+        following["reward"] = wanted - (along - wanted).abs()
+        tipped = observation[:, UPRIGHT, None] < 0.3
+        following["terminated"] = following["terminated"] | tipped
+        following["done"] = following["done"] | tipped
+        self._draw(torch.rand_like(self.length) < 1.0 / self.duration)
+        return self._show(following)
+
+    def transform_observation_spec(self, spec: Composite) -> Composite:
+        """Adds the progress of the step, metres."""
+        spec["along"] = Unbounded((*spec.shape, 1))
+        return spec
+
+
+def mirrored(data: TensorDictBase, actor: ProbabilisticActor) -> TensorDictBase:
+    """The same transitions, left and right exchanged: as good to learn from, for a robot alike."""
+    other = data.clone()
+    other["observation"] = data["observation"][:, OTHER_SIDE] * SIGNS
+    other["action"] = data["action"][:, OTHER_MOTORS]
+    other["action_log_prob"] = actor.get_dist(other.select("observation")).log_prob(other["action"])
+    return other
+
+
+class Head(nn.Module):
+    """The first entries of the observation: what the controller sees."""
+
+    def forward(self, observation: torch.Tensor) -> torch.Tensor:
+        """[*B, D] to [*B, 48]."""
+        return observation[..., :INPUT]
+
+
+def make_actor(cfg: DictConfig, env: TransformedEnv) -> ProbabilisticActor:
+    """A Gaussian before tanh, with one standard deviation per motor."""
+    size = env.action_spec.shape[-1]
+    network = MLP(INPUT, size, num_cells=list(cfg.policy.num_cells), activation_class=nn.ReLU)
+    with torch.no_grad():
+        network[-1].weight.mul_(0.01)
+    std = AddStateIndependentNormalScale(
+        size, scale_mapping="exp", init_value=math.log(cfg.policy.init_std)
+    )
+    module = nn.Sequential(Head(), network, std)
+    return ProbabilisticActor(
+        TensorDictModule(module, in_keys=["observation"], out_keys=["loc", "scale"]),
+        spec=env.full_action_spec_unbatched,
+        in_keys=["loc", "scale"],
+        distribution_class=TanhNormal,
+        distribution_kwargs={"low": -1.0, "high": 1.0},
+        return_log_prob=True,
+    )
+
+
+def make_critic(cfg: DictConfig) -> ValueOperator:
+    """The value of a state under its command."""
+    network = MLP(INPUT, 1, num_cells=list(cfg.critic.num_cells), activation_class=nn.ReLU)
+    return ValueOperator(nn.Sequential(Head(), network), in_keys=["observation"])
+
+
+def export(actor: ProbabilisticActor, path: Path, cfg: DictConfig) -> None:
+    """Writes the mean's network as half-precision weights and how they came about."""
+    layers = [m for m in actor.modules() if isinstance(m, nn.Linear)]
+    tensors = {}
+    for i, layer in enumerate(layers):
+        tensors[f"weight{i}"] = layer.weight.detach().half().contiguous()
+        tensors[f"bias{i}"] = layer.bias.detach().half()
+    save_file(tensors, path, metadata={"command": " ".join(["python", *sys.argv])})
+
+
+def make_env(cfg: DictConfig, num_envs: int, seed: int, **kwargs: object) -> SafeGoalEnv:
+    """Doggo on its own in the square."""
+    return SafeGoalEnv(
+        "doggo_torques",
+        num_envs=num_envs,
+        num_threads=cfg.num_threads,
+        seed=seed,
+        task=GoalTask(num_hazards=0, lidar_bins=3),
+        **kwargs,
+    )
+
+
+@torch.no_grad()
+def evaluate(env: TransformedEnv, actor: ProbabilisticActor, num_steps: int) -> dict[str, float]:
+    """Deterministic, full speed: metres per second towards the goal, and how many tipped over."""
+    with set_exploration_type(ExplorationType.DETERMINISTIC):
+        rollout = env.rollout(num_steps, actor, break_when_any_done=False)["next"]
+    return {
+        "eval/speed": rollout["along"].mean().item() / STEP,
+        "eval/tipped": rollout["terminated"].float().mean().item() * num_steps,
+    }
+
+
+@hydra.main(config_path=".", config_name="doggo_controller", version_base="1.3")
+def main(cfg: DictConfig) -> None:
+    """Train, measure and export a controller."""
+    torchrl_logger.setLevel("WARNING")  # its notes would break the progress bar
+    use_threads(cfg.num_threads)
+    torch.manual_seed(cfg.seed)
+
+    eval_env = TransformedEnv(
+        make_env(cfg, cfg.eval.num_envs, EVAL_SEED),
+        FollowCommand(cfg.eval.num_envs, cfg.command.top_speed, 1.0, math.inf),
+    )
+    actor = make_actor(cfg, eval_env)
+    critic = make_critic(cfg)
+    advantage = GAE(
+        gamma=cfg.loss.gamma,
+        lmbda=cfg.loss.lmbda,
+        value_network=critic,
+        average_gae=True,
+        deactivate_vmap=True,
+    )
+    loss = ClipPPOLoss(
+        actor,
+        critic,
+        clip_epsilon=cfg.loss.clip_epsilon,
+        entropy_bonus=False,
+        loss_critic_type="l2",
+    )
+    optim = torch.optim.Adam(loss.parameters(), lr=cfg.optim.lr, fused=True)
+    run = Run(cfg, loss=loss, optim=optim)
+    env = TransformedEnv(
+        make_env(
+            cfg,
+            cfg.env.num_envs,
+            seed=cfg.seed + run.frames,  # a resumed run sees new layouts
+            episode_length=cfg.env.episode_length,
+            stagger=True,
+        ),
+        FollowCommand(cfg.env.num_envs, **cfg.command),
+    )
+    total_frames = cfg.collector.total_frames
+    collector = Collector(
+        env,
+        actor,
+        frames_per_batch=cfg.collector.frames_per_batch,
+        total_frames=total_frames - run.frames,
+        exploration_type=ExplorationType.RANDOM,
+        auto_register_policy_transforms=False,
+    )
+
+    progress = tqdm(total=total_frames, initial=run.frames, unit="frame")
+    next_eval, next_save = (
+        run.frames // interval * interval + interval
+        for interval in (cfg.eval.interval, cfg.checkpoint.interval)
+    )
+    started = time.perf_counter()
+    with GracefulStop() as stop:
+        for batch in collector:
+            run.counters["frames"] += batch.numel()
+            for group in optim.param_groups:
+                group["lr"] = cfg.optim.lr * max(0.0, 1.0 - run.frames / total_frames)
+            with torch.no_grad():
+                advantage(batch)
+                data = batch.select(*USED).flatten()
+                data["observation"] = data["observation"][:, :INPUT]
+                data = torch.cat((data, mirrored(data, actor)))
+            for _ in range(cfg.optim.num_epochs):
+                for index in torch.randperm(len(data)).split(cfg.optim.minibatch_size):
+                    losses = loss(data[index])
+                    (losses["loss_objective"] + losses["loss_critic"]).backward()
+                    nn.utils.clip_grad_norm_(loss.parameters(), cfg.optim.max_grad_norm)
+                    optim.step()
+                    optim.zero_grad()
+
+            seconds = time.perf_counter() - started
+            started += seconds
+            run.counters["seconds"] += seconds
+            metrics = {
+                "train/reward": batch["next", "reward"].mean().item() / STEP,
+                "train/speed": batch["next", "along"].mean().item() / STEP,
+                "train/tipped": batch["next", "terminated"].float().mean().item(),
+                "train/std": batch["scale"].mean().item(),
+                "update/kl": losses["kl_approx"].item(),
+                "update/clip_fraction": losses["clip_fraction"].item(),
+                "update/loss_critic": losses["loss_critic"].item(),
+                "time/frames_per_second": batch.numel() / seconds,
+            }
+            if run.frames >= next_eval:
+                next_eval += cfg.eval.interval
+                metrics |= evaluate(eval_env, actor, cfg.eval.num_steps)
+            run.log(metrics)
+            progress.update(batch.numel())
+            progress.set_postfix({k: f"{metrics[f'train/{k}']:.3f}" for k in ("reward", "speed")})
+            if run.frames >= next_save or stop.requested:
+                next_save += cfg.checkpoint.interval
+                run.save()
+            if stop.requested:
+                break
+    progress.close()
+    collector.shutdown()
+    if stop.requested:
+        print(f"stopped at {run.frames} frames; go on with the same command and resume=true")
+        return
+    run.save()
+    path = run.path / "controller.safetensors"
+    export(actor, path, cfg)
+    for name, value in evaluate(eval_env, actor, cfg.eval.num_steps).items():
+        print(f"{name}: {value:.3f}")
+    print(f"controller: {path}")
+
+
+if __name__ == "__main__":
+    main()

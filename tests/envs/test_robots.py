@@ -12,7 +12,7 @@ import torch
 from tensordict import TensorDict
 from torchrl.envs.utils import check_env_specs
 
-from torchrl_safe.envs import ROBOTS, SafeGoalEnv, get_robot
+from torchrl_safe.envs import SafeGoalEnv, get_robot
 from torchrl_safe.envs._core import RobotBatch
 
 CAPSULE, CYLINDER = mujoco.mjtGeom.mjGEOM_CAPSULE, mujoco.mjtGeom.mjGEOM_CYLINDER
@@ -21,7 +21,7 @@ STEPS = 40
 
 
 def safety_gym_world(timestep: float, height: float) -> tuple[mujoco.MjSpec, mujoco.MjsBody]:
-    """The world that Safety Gym puts a robot in: floor, light, and the robot's sensors at its origin."""
+    """The world Safety Gym puts a robot in: floor, light, sensors at the robot's origin."""
     spec = mujoco.MjSpec()
     spec.option.timestep = timestep
     spec.worldbody.add_geom(
@@ -36,9 +36,7 @@ def safety_gym_world(timestep: float, height: float) -> tuple[mujoco.MjSpec, muj
         ("velocimeter", mujoco.mjtSensor.mjSENS_VELOCIMETER),
         ("gyro", mujoco.mjtSensor.mjSENS_GYRO),
     ):
-        spec.add_sensor(
-            name=name, type=kind, objtype=mujoco.mjtObj.mjOBJ_SITE, objname="robot"
-        )
+        spec.add_sensor(name=name, type=kind, objtype=mujoco.mjtObj.mjOBJ_SITE, objname="robot")
     return spec, body
 
 
@@ -138,8 +136,8 @@ def held_actions(size: int, num_envs: int, seed: int = 0) -> np.ndarray:
     return draws
 
 
-# (robot, reference, how far the robot's x axis is turned from the reference's, tolerance). The car
-# faces -y in Safety Gym and x here, so rounding differs; Doggo's motion is the same to the last bit.
+# Robot, reference, angle from the robot's x axis to the reference's, tolerance. The car faces -y in
+# Safety Gym and x here, so rounding differs; Doggo's motion is the same to the last bit.
 @pytest.mark.parametrize(
     ("name", "reference", "turn", "tolerance"),
     [("car", reference_car, math.pi / 2, 1e-12), ("doggo", reference_doggo, 0.0, 0.0)],
@@ -196,3 +194,157 @@ def test_motion_is_that_of_safety_gym(name, reference, turn, tolerance):
             np.testing.assert_allclose(yaw_rate, aside.sensor("gyro").data[2], atol=1e-10)
         travelled = max(travelled, np.abs(robots.motion.position - position).max())
     assert travelled > 0.1
+
+
+def rotation_of(quaternion: np.ndarray) -> np.ndarray:
+    rotation = np.empty(9)
+    mujoco.mju_quat2Mat(rotation, quaternion)
+    return rotation.reshape(3, 3)
+
+
+def tumbled(name: str, num_envs: int = 40) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """qpos, qvel and qacc of robots in all attitudes."""
+    rng = np.random.default_rng(5)
+    model = mujoco.MjModel.from_xml_path(str(get_robot(name).asset_path))
+    qpos = rng.normal(size=(num_envs, model.nq))
+    qpos[:, 3:7] /= np.linalg.norm(qpos[:, 3:7], axis=1, keepdims=True)
+    return qpos, rng.normal(size=(num_envs, model.nv)), rng.normal(size=(num_envs, model.nv))
+
+
+@pytest.mark.parametrize("name", ["car", "doggo"])
+def test_sensing_in_any_attitude(name):
+    qpos, qvel, qacc = tumbled(name)
+    motion = get_robot(name).sense(qpos, qvel, qacc)
+    upside_down = 0
+    for i in range(len(qpos)):
+        rotation = rotation_of(qpos[i, 3:7])
+        expected = [
+            *(rotation.T @ (qacc[i, :3] + (0, 0, 9.81)))[:2],
+            *(rotation.T @ qvel[i, :3])[:2],
+            qvel[i, 5],
+        ]
+        np.testing.assert_allclose(motion.proprioception[i], expected, atol=1e-12)
+        ahead = rotation[:2, 0] / np.linalg.norm(rotation[:2, 0])
+        np.testing.assert_allclose(motion.heading[i], ahead, atol=1e-12)
+        assert (motion.position[i] == qpos[i, :2]).all()
+        upside_down += rotation[2, 2] < 0
+    assert 5 < upside_down < 35
+
+
+def test_heading_of_a_robot_standing_on_its_nose():
+    qpos = np.zeros((1, 13))
+    qpos[0, 3:7] = math.sqrt(0.5), 0, math.sqrt(0.5), 0  # x straight down
+    motion = get_robot("car").sense(qpos, np.zeros((1, 11)), np.zeros((1, 11)))
+    assert np.linalg.norm(motion.heading[0]) == pytest.approx(1.0)
+    assert motion.proprioception[0, 0] == pytest.approx(-9.81)  # all of its weight, from behind
+
+
+def test_joint_readings_by_name():
+    """The readings a controller of legs sees, joint by joint."""
+    qpos, qvel, qacc = tumbled("doggo", 10)
+    model = mujoco.MjModel.from_xml_path(str(get_robot("doggo").asset_path))
+    readings = get_robot("doggo_torques").sense(qpos, qvel, qacc).proprioception
+    assert readings.shape == (10, 45)
+    legs = ("front_left", "front_right", "rear_left", "rear_right")
+    joints = [f"{leg}_{part}" for leg in legs for part in ("hip_z", "hip_y", "ankle")]
+    assert model.nu == len(joints)
+    for i in range(10):
+        rotation = rotation_of(qpos[i, 3:7])
+        np.testing.assert_allclose(readings[i, :3], rotation.T @ qvel[i, :3], atol=1e-12)
+        assert (readings[i, 3:6] == qvel[i, 3:6]).all()
+        np.testing.assert_allclose(readings[i, 6:9], rotation.T @ (0, 0, 1), atol=1e-12)
+        for k, name in enumerate(joints):
+            joint = model.joint(name)
+            assert readings[i, 9 + k] == qvel[i, joint.dofadr[0]]
+            assert readings[i, 21 + k] == math.sin(qpos[i, joint.qposadr[0]])
+            assert readings[i, 33 + k] == math.cos(qpos[i, joint.qposadr[0]])
+
+
+@pytest.mark.parametrize("name", ["car", "doggo", "doggo_torques"])
+class TestEnvironment:
+    @staticmethod
+    def drive(env: SafeGoalEnv, steps: int, seed: int = 0) -> TensorDict:
+        """Steps under random actions, resetting what is done: [T, N]."""
+        generator = torch.Generator().manual_seed(seed)
+        td = env.reset()
+        rollout = []
+        for _ in range(steps):
+            td["action"] = torch.rand(env.action_spec.shape, generator=generator) * 2 - 1
+            step, td = env.step_and_maybe_reset(td)
+            rollout.append(step)
+        return torch.stack(rollout)
+
+    def test_check_env_specs(self, name):
+        check_env_specs(SafeGoalEnv(name, num_envs=3, num_threads=1, episode_length=7), seed=0)
+
+    def test_sizes(self, name):
+        env = SafeGoalEnv(name, num_envs=2, num_threads=1)
+        sizes = {"car": (24, 2), "doggo": (24, 2), "doggo_torques": (64, 12)}
+        assert env.observation_spec["observation"].shape == (2, sizes[name][0])
+        assert env.action_spec.shape == (2, sizes[name][1])
+
+    def test_threads(self, name):
+        options = {"num_envs": 5, "episode_length": 15, "seed": 4}
+        one = self.drive(SafeGoalEnv(name, num_threads=1, **options), 40)
+        two = self.drive(SafeGoalEnv(name, num_threads=2, **options), 40)
+        assert (one == two).all()
+
+    def test_resumes_exactly(self, name):
+        """The solver's first guess is part of the state."""
+        env = SafeGoalEnv(name, num_envs=3, num_threads=1)
+        self.drive(env, 10)
+        state = env.state_dict()
+        action = torch.linspace(-1, 1, env.action_spec.shape.numel()).view(env.action_spec.shape)
+        td = TensorDict({"action": action}, [3])
+        first = [env.step(td.clone())["next", "observation"] for _ in range(5)]
+        env.load_state_dict(state)
+        for observation in first:
+            assert (env.step(td.clone())["next", "observation"] == observation).all()
+
+    def test_reset_puts_it_at_rest(self, name):
+        env = SafeGoalEnv(name, num_envs=20, num_threads=1)
+        self.drive(env, 10)
+        env.reset()
+        qpos, qvel = (env._core._robots.batch.bind(key) for key in ("qpos", "qvel"))
+        assert not qvel.any()
+        height = {"car": 0.1}.get(name, 0.22)
+        assert (qpos[:, 2] == height).all()
+        for i in range(20):
+            assert (env.layout(i)["robot"] == qpos[i, :2]).all()
+            x_axis = rotation_of(qpos[i, 3:7])[:, 0]
+            np.testing.assert_allclose(x_axis, (*env.layout(i)["heading"], 0), atol=1e-12)
+
+    def test_random_steps(self, name):
+        env = SafeGoalEnv(name, num_envs=32, num_threads=2)
+        rollout = self.drive(env, 150)
+        assert rollout["next", "observation"].isfinite().all()
+        assert env.instabilities == 0
+        assert not env._core._robots.batch.warning[..., 1].any()
+        assert not rollout["next", "terminated"].any()
+
+
+def test_a_robot_on_its_back_goes_on():
+    """Safety Gym does not end an episode because of it."""
+    env = SafeGoalEnv("car", num_envs=2, num_threads=1, episode_length=50)
+    env.reset()
+    qpos = env._core._robots.batch.bind("qpos")
+    qpos[0, 3:7] = 0, 1, 0, 0
+    following = [env.step(TensorDict({"action": torch.ones(2, 2)}, [2]))["next"] for _ in range(30)]
+    assert rotation_of(qpos[0, 3:7])[2, 2] < -0.9
+    assert rotation_of(qpos[1, 3:7])[2, 2] > 0.9
+    for step in following:
+        assert not step["done"].any()
+        assert step["observation"].isfinite().all()
+
+
+def test_car_drives():
+    """Both wheels ahead: forwards along x. Right wheel only: a turn to the left."""
+    env = SafeGoalEnv("car", num_envs=2, num_threads=1)
+    env.reset()
+    before = [env.layout(i) for i in range(2)]
+    action = torch.tensor([[1.0, 1.0], [1.0, -1.0]])
+    for _ in range(25):
+        td = env.step(TensorDict({"action": action}, [2]))
+    moved = env.layout(0)["robot"] - before[0]["robot"]
+    assert moved @ before[0]["heading"] > 0.1
+    assert td["next", "observation"][1, 7] * 2.0 > 0.5

@@ -11,12 +11,13 @@ fast is drawn anew every few seconds. What the package ships is the exported
 from __future__ import annotations
 
 import math
-import sys
 import time
 from pathlib import Path
 
 import hydra
+import numpy as np
 import torch
+from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 from safetensors.torch import save_file
 from tensordict import TensorDictBase
@@ -33,12 +34,14 @@ from torchrl.objectives.value import GAE
 from tqdm import tqdm
 from utils import EVAL_SEED, GracefulStop, Run, use_threads
 
-from torchrl_safe.envs import GoalTask, SafeGoalEnv
+from torchrl_safe.envs import GoalTask, SafeGoalEnv, get_robot
 
 STEP = 0.1  # seconds
 # What the controller sees: direction (2) and length (1) of the local goal; the trunk's velocity
 # (3), angular velocity (3) and vertical (3); velocity, sine and cosine of 12 joints.
 INPUT = 48
+# What the observation has divided these by.
+SCALE = torch.tensor((0.7, 0.7, 1.0, *get_robot("doggo_torques").proprioception_scale))
 UPRIGHT = 11  # the vertical component of the trunk's z axis
 
 
@@ -73,7 +76,8 @@ class FollowCommand(Transform):
         return td.set("observation", observation)
 
     def _reset(self, td: TensorDictBase, reset: TensorDictBase) -> TensorDictBase:
-        self._draw(td.get("_reset", torch.ones_like(reset["done"])) if td is not None else True)
+        everywhere = torch.ones_like(reset["done"])
+        self._draw(everywhere if td is None else td.get("_reset", everywhere))
         reset["along"] = torch.zeros_like(self.length)
         return self._show(reset)
 
@@ -112,9 +116,9 @@ class Head(nn.Module):
         return observation[..., :INPUT]
 
 
-def make_actor(cfg: DictConfig, env: TransformedEnv) -> ProbabilisticActor:
+def make_actor(cfg: DictConfig) -> ProbabilisticActor:
     """A Gaussian before tanh, with one standard deviation per motor."""
-    size = env.action_spec.shape[-1]
+    size = get_robot("doggo_torques").action_dim
     network = MLP(INPUT, size, num_cells=list(cfg.policy.num_cells), activation_class=nn.ReLU)
     with torch.no_grad():
         network[-1].weight.mul_(0.01)
@@ -124,7 +128,6 @@ def make_actor(cfg: DictConfig, env: TransformedEnv) -> ProbabilisticActor:
     module = nn.Sequential(Head(), network, std)
     return ProbabilisticActor(
         TensorDictModule(module, in_keys=["observation"], out_keys=["loc", "scale"]),
-        spec=env.full_action_spec_unbatched,
         in_keys=["loc", "scale"],
         distribution_class=TanhNormal,
         distribution_kwargs={"low": -1.0, "high": 1.0},
@@ -138,14 +141,21 @@ def make_critic(cfg: DictConfig) -> ValueOperator:
     return ValueOperator(nn.Sequential(Head(), network), in_keys=["observation"])
 
 
-def export(actor: ProbabilisticActor, path: Path, cfg: DictConfig) -> None:
-    """Writes the mean's network as half-precision weights and how they came about."""
-    layers = [m for m in actor.modules() if isinstance(m, nn.Linear)]
+def export(actor: ProbabilisticActor, path: Path) -> None:
+    """Writes the mean's network in half precision, and the command that made it.
+
+    What the observation divides its entries by goes into the first weights: the exported network
+    takes the readings as they are.
+    """
+    layers = [module for module in actor.modules() if isinstance(module, nn.Linear)]
     tensors = {}
     for i, layer in enumerate(layers):
-        tensors[f"weight{i}"] = layer.weight.detach().half().contiguous()
-        tensors[f"bias{i}"] = layer.bias.detach().half()
-    save_file(tensors, path, metadata={"command": " ".join(["python", *sys.argv])})
+        weight = layer.weight.detach() / SCALE if i == 0 else layer.weight.detach()
+        tensors |= {f"weight{i}": weight.half(), f"bias{i}": layer.bias.detach().half()}
+    overrides = HydraConfig.get().overrides.task
+    options = [option for option in overrides if not option.startswith(("run_dir", "resume"))]
+    command = " ".join(["python examples/doggo_controller.py", *options])
+    save_file(tensors, path, metadata={"command": command})
 
 
 def make_env(cfg: DictConfig, num_envs: int, seed: int, **kwargs: object) -> SafeGoalEnv:
@@ -161,14 +171,37 @@ def make_env(cfg: DictConfig, num_envs: int, seed: int, **kwargs: object) -> Saf
 
 
 @torch.no_grad()
-def evaluate(env: TransformedEnv, actor: ProbabilisticActor, num_steps: int) -> dict[str, float]:
-    """Deterministic, full speed: metres per second towards the goal, and how many tipped over."""
+def speed_by_direction(actor: ProbabilisticActor, cfg: DictConfig) -> torch.Tensor:
+    """Metres per second along fixed directions of the world, by deterministic actions.
+
+    Direction i is i / n of a full turn to the left of where the robot faced when it stood there;
+    the local goal, of length one, is shown in the robot's frame of the moment.
+
+    Returns:
+        Tensor: [n], displacement along the direction over the time it took, start included.
+    """
+    env = make_env(cfg, cfg.eval.num_directions, EVAL_SEED)
+    td = env.reset()
+
+    def where() -> tuple[torch.Tensor, torch.Tensor]:
+        layouts = [env.layout(i) for i in range(cfg.eval.num_directions)]
+        position, heading = (
+            torch.from_numpy(np.stack([layout[key] for layout in layouts]))
+            for key in ("robot", "heading")
+        )
+        return position, torch.view_as_complex(heading)
+
+    start, heading = where()
+    turns = torch.arange(cfg.eval.num_directions) / cfg.eval.num_directions
+    direction = heading * torch.exp(2j * torch.pi * turns)
     with set_exploration_type(ExplorationType.DETERMINISTIC):
-        rollout = env.rollout(num_steps, actor, break_when_any_done=False)["next"]
-    return {
-        "eval/speed": rollout["along"].mean().item() / STEP,
-        "eval/tipped": rollout["terminated"].float().mean().item() * num_steps,
-    }
+        for _ in range(cfg.eval.num_steps):
+            local = torch.view_as_real(direction * heading.conj()).float()
+            td["observation"][:, :2], td["observation"][:, 2] = local / SCALE[:2], 1.0
+            td = env.step(actor(td))["next"]
+            position, heading = where()
+    moved = torch.view_as_complex(position - start)
+    return (moved * direction.conj()).real / (cfg.eval.num_steps * STEP)
 
 
 @hydra.main(config_path=".", config_name="doggo_controller", version_base="1.3")
@@ -178,11 +211,7 @@ def main(cfg: DictConfig) -> None:
     use_threads(cfg.num_threads)
     torch.manual_seed(cfg.seed)
 
-    eval_env = TransformedEnv(
-        make_env(cfg, cfg.eval.num_envs, EVAL_SEED),
-        FollowCommand(cfg.eval.num_envs, cfg.command.top_speed, 1.0, math.inf),
-    )
-    actor = make_actor(cfg, eval_env)
+    actor = make_actor(cfg)
     critic = make_critic(cfg)
     advantage = GAE(
         gamma=cfg.loss.gamma,
@@ -259,7 +288,8 @@ def main(cfg: DictConfig) -> None:
             }
             if run.frames >= next_eval:
                 next_eval += cfg.eval.interval
-                metrics |= evaluate(eval_env, actor, cfg.eval.num_steps)
+                speed = speed_by_direction(actor, cfg)
+                metrics |= {"eval/speed": speed.mean().item(), "eval/slowest": speed.min().item()}
             run.log(metrics)
             progress.update(batch.numel())
             progress.set_postfix({k: f"{metrics[f'train/{k}']:.3f}" for k in ("reward", "speed")})
@@ -275,9 +305,10 @@ def main(cfg: DictConfig) -> None:
         return
     run.save()
     path = run.path / "controller.safetensors"
-    export(actor, path, cfg)
-    for name, value in evaluate(eval_env, actor, cfg.eval.num_steps).items():
-        print(f"{name}: {value:.3f}")
+    export(actor, path)
+    speed = speed_by_direction(actor, cfg)
+    for i, value in enumerate(speed.tolist()):
+        print(f"{360 * i / len(speed):4.0f} degrees: {value:.3f} m/s")
     print(f"controller: {path}")
 
 

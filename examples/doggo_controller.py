@@ -10,7 +10,6 @@ fast is drawn anew every few seconds. What the package ships is the exported
 
 from __future__ import annotations
 
-import math
 import time
 from pathlib import Path
 
@@ -21,7 +20,7 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 from safetensors.torch import save_file
 from tensordict import TensorDictBase
-from tensordict.nn import AddStateIndependentNormalScale, TensorDictModule
+from tensordict.nn import TensorDictModule
 from torch import nn
 from torchrl._utils import logger as torchrl_logger
 from torchrl.collectors import Collector
@@ -116,16 +115,25 @@ class Head(nn.Module):
         return observation[..., :INPUT]
 
 
-def make_actor(cfg: DictConfig) -> ProbabilisticActor:
-    """A Gaussian before tanh, with one standard deviation per motor."""
+class Noise(nn.Module):
+    """Puts a given standard deviation beside the mean."""
+
+    def __init__(self, std: float):
+        super().__init__()
+        self.std = nn.Parameter(torch.tensor(std), requires_grad=False)
+
+    def forward(self, loc: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """[*B, A] to [*B, A] twice."""
+        return loc, self.std.expand_as(loc)
+
+
+def make_actor(cfg: DictConfig, noise: Noise) -> ProbabilisticActor:
+    """A Gaussian before tanh."""
     size = get_robot("doggo_torques").action_dim
     network = MLP(INPUT, size, num_cells=list(cfg.policy.num_cells), activation_class=nn.ReLU)
     with torch.no_grad():
         network[-1].weight.mul_(0.01)
-    std = AddStateIndependentNormalScale(
-        size, scale_mapping="exp", init_value=math.log(cfg.policy.init_std)
-    )
-    module = nn.Sequential(Head(), network, std)
+    module = nn.Sequential(Head(), network, noise)
     return ProbabilisticActor(
         TensorDictModule(module, in_keys=["observation"], out_keys=["loc", "scale"]),
         in_keys=["loc", "scale"],
@@ -211,8 +219,8 @@ def main(cfg: DictConfig) -> None:
     use_threads(cfg.num_threads)
     torch.manual_seed(cfg.seed)
 
-    actor = make_actor(cfg)
-    critic = make_critic(cfg)
+    noise = Noise(cfg.policy.init_std)
+    actor, critic = make_actor(cfg, noise), make_critic(cfg)
     advantage = GAE(
         gamma=cfg.loss.gamma,
         lmbda=cfg.loss.lmbda,
@@ -258,13 +266,12 @@ def main(cfg: DictConfig) -> None:
     with GracefulStop() as stop:
         for batch in collector:
             run.counters["frames"] += batch.numel()
-            for group in optim.param_groups:
-                group["lr"] = cfg.optim.lr * max(0.0, 1.0 - run.frames / total_frames)
             with torch.no_grad():
                 advantage(batch)
                 data = batch.select(*USED).flatten()
                 data["observation"] = data["observation"][:, :INPUT]
                 data = torch.cat((data, mirrored(data, actor)))
+            kl = []
             for _ in range(cfg.optim.num_epochs):
                 for index in torch.randperm(len(data)).split(cfg.optim.minibatch_size):
                     losses = loss(data[index])
@@ -272,6 +279,13 @@ def main(cfg: DictConfig) -> None:
                     nn.utils.clip_grad_norm_(loss.parameters(), cfg.optim.max_grad_norm)
                     optim.step()
                     optim.zero_grad()
+                    kl.append(losses["kl_approx"].item())
+            # Steps are as long as the policy may move: less and less, as the noise falls.
+            for group in optim.param_groups:
+                group["lr"] *= 1.1 if sum(kl) / len(kl) < cfg.optim.kl else 1 / 1.1
+            # Less and less noise, or the robot learns a walk that the noise has to start.
+            share = min(1.0, run.frames / (cfg.policy.decay_share * total_frames))
+            noise.std.fill_(cfg.policy.init_std ** (1 - share) * cfg.policy.final_std**share)
 
             seconds = time.perf_counter() - started
             started += seconds
@@ -280,8 +294,9 @@ def main(cfg: DictConfig) -> None:
                 "train/reward": batch["next", "reward"].mean().item() / STEP,
                 "train/speed": batch["next", "along"].mean().item() / STEP,
                 "train/tipped": batch["next", "terminated"].float().mean().item(),
-                "train/std": batch["scale"].mean().item(),
-                "update/kl": losses["kl_approx"].item(),
+                "train/std": noise.std.item(),
+                "update/kl": sum(kl) / len(kl),
+                "update/lr": optim.param_groups[0]["lr"],
                 "update/clip_fraction": losses["clip_fraction"].item(),
                 "update/loss_critic": losses["loss_critic"].item(),
                 "time/frames_per_second": batch.numel() / seconds,

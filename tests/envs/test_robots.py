@@ -140,13 +140,13 @@ def held_actions(size: int, num_envs: int, seed: int = 0) -> np.ndarray:
 # Safety Gym and x here, so rounding differs; Doggo's motion is the same to the last bit.
 @pytest.mark.parametrize(
     ("name", "reference", "turn", "tolerance"),
-    [("car", reference_car, math.pi / 2, 1e-12), ("doggo", reference_doggo, 0.0, 0.0)],
+    [("car", reference_car, math.pi / 2, 1e-12), ("doggo_torques", reference_doggo, 0.0, 0.0)],
 )
 def test_motion_is_that_of_safety_gym(name, reference, turn, tolerance):
     num_envs = 6
-    # Without Doggo's controller: twelve torques.
-    robot = replace(get_robot(name), control=get_robot("car").control)
-    robots = RobotBatch(robot, num_envs, 1)
+    # Doggo with the planar readings of a robot on wheels.
+    planar = {key: getattr(get_robot("car"), key) for key in ("sense", "proprioception_scale")}
+    robots = RobotBatch(replace(get_robot(name), **planar), num_envs, 1)
     rng = np.random.default_rng(1)
     position, yaw = rng.uniform(-1, 1, (num_envs, 2)), rng.uniform(0, 2 * math.pi, num_envs)
     robots.place(np.arange(num_envs), position, yaw)
@@ -211,10 +211,9 @@ def tumbled(name: str, num_envs: int = 40) -> tuple[np.ndarray, np.ndarray, np.n
     return qpos, rng.normal(size=(num_envs, model.nv)), rng.normal(size=(num_envs, model.nv))
 
 
-@pytest.mark.parametrize("name", ["car", "doggo"])
-def test_sensing_in_any_attitude(name):
-    qpos, qvel, qacc = tumbled(name)
-    motion = get_robot(name).sense(qpos, qvel, qacc)
+def test_sensing_in_any_attitude():
+    qpos, qvel, qacc = tumbled("car")
+    motion = get_robot("car").sense(qpos, qvel, qacc)
     upside_down = 0
     for i in range(len(qpos)):
         rotation = rotation_of(qpos[i, 3:7])
@@ -241,8 +240,8 @@ def test_heading_of_a_robot_standing_on_its_nose():
 
 def test_joint_readings_by_name():
     """The readings a controller of legs sees, joint by joint."""
-    qpos, qvel, qacc = tumbled("doggo", 10)
-    model = mujoco.MjModel.from_xml_path(str(get_robot("doggo").asset_path))
+    qpos, qvel, qacc = tumbled("doggo_torques", 10)
+    model = mujoco.MjModel.from_xml_path(str(get_robot("doggo_torques").asset_path))
     readings = get_robot("doggo_torques").sense(qpos, qvel, qacc).proprioception
     assert readings.shape == (10, 45)
     legs = ("front_left", "front_right", "rear_left", "rear_right")
@@ -260,7 +259,7 @@ def test_joint_readings_by_name():
             assert readings[i, 33 + k] == math.cos(qpos[i, joint.qposadr[0]])
 
 
-@pytest.mark.parametrize("name", ["car", "doggo", "doggo_torques"])
+@pytest.mark.parametrize("name", ["car", "doggo_torques"])
 class TestEnvironment:
     @staticmethod
     def drive(env: SafeGoalEnv, steps: int, seed: int = 0) -> TensorDict:
@@ -279,7 +278,7 @@ class TestEnvironment:
 
     def test_sizes(self, name):
         env = SafeGoalEnv(name, num_envs=2, num_threads=1)
-        sizes = {"car": (24, 2), "doggo": (24, 2), "doggo_torques": (64, 12)}
+        sizes = {"car": (24, 2), "doggo_torques": (64, 12)}
         assert env.observation_spec["observation"].shape == (2, sizes[name][0])
         assert env.action_spec.shape == (2, sizes[name][1])
 

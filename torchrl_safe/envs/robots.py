@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
-from functools import cache, partial
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-
-from torchrl_safe.envs._controller import LegController
 
 Array = NDArray[np.float64]
 
@@ -180,12 +178,13 @@ def _sense_free(qpos: Array, qvel: Array, qacc: Array) -> Motion:
     return Motion(qpos[:, :2].copy(), _heading(rotation), proprioception)
 
 
-def _joint_readings(qpos: Array, qvel: Array, rotation: Array) -> Array:
-    """What moves Doggo's legs has to know, [N, 45].
+def _sense_joints(qpos: Array, qvel: Array, qacc: Array) -> Motion:
+    """What one that drives Doggo's motors has to know, 45 readings.
 
     Velocity (3) and angular velocity (3) of the trunk and the vertical (3), all in its frame;
     velocity (12), sine (12) and cosine (12) of the driven joints.
     """
+    rotation = _rotation(qpos[:, 3:7])
     angle = qpos[:, _DOGGO_JOINTS + 7]
     parts = (
         np.einsum("nji,nj->ni", rotation, qvel[:, :3]),
@@ -195,22 +194,7 @@ def _joint_readings(qpos: Array, qvel: Array, rotation: Array) -> Array:
         np.sin(angle),
         np.cos(angle),
     )
-    return np.concatenate(parts, 1)
-
-
-def _sense_joints(qpos: Array, qvel: Array, qacc: Array) -> Motion:
-    rotation = _rotation(qpos[:, 3:7])
-    readings = _joint_readings(qpos, qvel, rotation)
-    return Motion(qpos[:, :2].copy(), _heading(rotation), readings)
-
-
-@cache
-def _doggo_controller() -> LegController:
-    return LegController.load(_ASSETS / "doggo_controller.safetensors")
-
-
-def _control_legs(action: Array, qpos: Array, qvel: Array) -> Array:
-    return _doggo_controller()(action, _joint_readings(qpos, qvel, _rotation(qpos[:, 3:7])))
+    return Motion(qpos[:, :2].copy(), _heading(rotation), np.concatenate(parts, 1))
 
 
 _POINT = Robot(
@@ -256,32 +240,20 @@ _CAR = Robot(
     sense=_sense_free,
 )
 
-_DOGGO = Robot(
-    name="doggo",
+_DOGGO_TORQUES = Robot(
+    name="doggo_torques",
     asset="doggo.xml",
     timestep=0.01,
     substeps=10,
     keepout=0.4,
-    action_dim=2,
-    proprioception_scale=(8.0, 8.0, 0.2, 0.2, 2.0),
-    place=partial(_place_free, height=0.22, joints=(0.0,) * 13),
-    control=_control_legs,
-    sense=_sense_free,
-)
-
-# Doggo without its controller: the policy drives the motors and senses the joints.
-_DOGGO_TORQUES = replace(
-    _DOGGO,
-    name="doggo_torques",
     action_dim=12,
     proprioception_scale=(0.5,) * 3 + (2.0,) * 3 + (1.0,) * 3 + (5.0,) * 12 + (1.0,) * 24,
+    place=partial(_place_free, height=0.22, joints=(0.0,) * 13),
     control=_control_directly,
     sense=_sense_joints,
 )
 
-ROBOTS: dict[str, Robot] = {
-    robot.name: robot for robot in (_POINT, _CAR, _DOGGO, _DOGGO_TORQUES, _JACKAL)
-}
+ROBOTS: dict[str, Robot] = {robot.name: robot for robot in (_POINT, _CAR, _DOGGO_TORQUES, _JACKAL)}
 
 
 def get_robot(name: str) -> Robot:

@@ -14,6 +14,10 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 _ASSETS = Path(__file__).parent / "assets"
+_GRAVITY = 9.81
+
+# Doggo's driven joints, counted behind the free base; the waist, number 6, has no motor.
+_DOGGO_JOINTS = np.delete(np.arange(13), 6)
 
 _JACKAL_WHEEL_RADIUS, _JACKAL_TRACK = 0.098, 0.376
 
@@ -144,6 +148,55 @@ def _sense_wheels(qpos: Array, qvel: Array, qacc: Array) -> Motion:
     return Motion(qpos[:, :2].copy(), heading, np.stack((forward, qvel[:, 5]), 1))
 
 
+def _rotation(quaternion: Array) -> Array:
+    """Matrices [N, 3, 3] of unit quaternions [N, 4]; columns are the body's axes in the world."""
+    w, x, y, z = quaternion.T
+    rows = (
+        (1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)),
+        (2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)),
+        (2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)),
+    )
+    return np.array(rows).transpose(2, 0, 1)
+
+
+def _heading(rotation: Array) -> Array:
+    """Where the body's x axis points in the plane; east if it points straight up or down."""
+    ahead = rotation[:, :2, 0]
+    length = np.hypot(ahead[:, 0], ahead[:, 1])[:, None]
+    return np.where(length > 1e-9, ahead / np.maximum(length, 1e-9), (1.0, 0.0))
+
+
+def _sense_free(qpos: Array, qvel: Array, qacc: Array) -> Motion:
+    """Accelerometer xy, velocity xy and yaw rate of a free base, in its own, tilting frame."""
+    rotation = _rotation(qpos[:, 3:7])
+    proprioception = np.empty((len(qpos), 5))
+    # An accelerometer at rest shows gravity's reaction: tilt is felt.
+    felt = qacc[:, :3] + (0.0, 0.0, _GRAVITY)
+    proprioception[:, :2] = np.einsum("nji,nj->ni", rotation[:, :, :2], felt)
+    proprioception[:, 2:4] = np.einsum("nji,nj->ni", rotation[:, :, :2], qvel[:, :3])
+    proprioception[:, 4] = qvel[:, 5]
+    return Motion(qpos[:, :2].copy(), _heading(rotation), proprioception)
+
+
+def _sense_joints(qpos: Array, qvel: Array, qacc: Array) -> Motion:
+    """What one that drives Doggo's motors has to know, 45 readings.
+
+    Velocity (3) and angular velocity (3) of the trunk and the vertical (3), all in its frame;
+    velocity (12), sine (12) and cosine (12) of the driven joints.
+    """
+    rotation = _rotation(qpos[:, 3:7])
+    angle = qpos[:, _DOGGO_JOINTS + 7]
+    parts = (
+        np.einsum("nji,nj->ni", rotation, qvel[:, :3]),
+        qvel[:, 3:6],
+        rotation[:, 2],
+        qvel[:, _DOGGO_JOINTS + 6],
+        np.sin(angle),
+        np.cos(angle),
+    )
+    return Motion(qpos[:, :2].copy(), _heading(rotation), np.concatenate(parts, 1))
+
+
 _POINT = Robot(
     name="point",
     asset="point.xml",
@@ -174,7 +227,33 @@ _JACKAL = Robot(
     footprint=(0.229, 0.208),
 )
 
-ROBOTS: dict[str, Robot] = {robot.name: robot for robot in (_POINT, _JACKAL)}
+_CAR = Robot(
+    name="car",
+    asset="car.xml",
+    timestep=0.004,
+    substeps=10,
+    keepout=0.4,
+    action_dim=2,
+    proprioception_scale=(8.0, 8.0, 0.2, 0.2, 2.0),
+    place=partial(_place_free, height=0.1, joints=(0.0, 0.0, 1.0, 0.0, 0.0, 0.0)),
+    control=_control_directly,
+    sense=_sense_free,
+)
+
+_DOGGO_TORQUES = Robot(
+    name="doggo_torques",
+    asset="doggo.xml",
+    timestep=0.01,
+    substeps=10,
+    keepout=0.4,
+    action_dim=12,
+    proprioception_scale=(0.5,) * 3 + (2.0,) * 3 + (1.0,) * 3 + (5.0,) * 12 + (1.0,) * 24,
+    place=partial(_place_free, height=0.22, joints=(0.0,) * 13),
+    control=_control_directly,
+    sense=_sense_joints,
+)
+
+ROBOTS: dict[str, Robot] = {robot.name: robot for robot in (_POINT, _CAR, _DOGGO_TORQUES, _JACKAL)}
 
 
 def get_robot(name: str) -> Robot:

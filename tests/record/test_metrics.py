@@ -17,6 +17,7 @@ from torchrl_safe.record import (
     bootstrap_interval,
     count_violations,
     evaluate,
+    proportion_interval,
     score,
     summarize,
 )
@@ -327,3 +328,24 @@ def test_batch_metrics_rejects():
         count_violations(td)
     with pytest.raises(ValueError, match="at least one step"):
         batch_metrics(td[:0])
+
+
+class TestProportionInterval:
+    @pytest.mark.parametrize(("successes", "trials"), [(0, 100), (3, 7), (50, 100), (20, 20)])
+    def test_is_wilsons(self, successes, trials):
+        expected = scipy.stats.binomtest(successes, trials).proportion_ci(method="wilson")
+        assert proportion_interval(successes, trials) == pytest.approx(
+            (expected.low, expected.high), abs=1e-12
+        )
+
+    @pytest.mark.parametrize(
+        ("successes", "trials", "message"),
+        [
+            (0, 0, "trials must be at least 1, got 0"),
+            (5, 4, r"successes must be in \[0, 4\], got 5"),
+            (-1, 4, r"successes must be in \[0, 4\], got -1"),
+        ],
+    )
+    def test_misuse(self, successes, trials, message):
+        with pytest.raises(ValueError, match=message):
+            proportion_interval(successes, trials)

@@ -202,3 +202,31 @@ def test_rejects(tmp_path, bad, message):
         record_video(env, policy, **({"path": tmp_path / "a.mp4"} | bad))
     assert env.modes == []
     assert os.listdir(tmp_path) == []
+
+
+def test_grid(tmp_path):
+    """Three environments, which end after 3, 4 and 5 steps, in a square with a white corner."""
+    path = record_video(
+        FilmedEnv(length=3, num_envs=3),
+        policy,
+        tmp_path / "grid.mp4",
+        num_steps=10,
+        every=1,
+        width=64,
+        height=48,
+        index=[0, 1, 2],
+    )
+    frames = [frame.astype(int) for frame in imageio.get_reader(path)]
+    assert len(frames) == 5
+    assert frames[0].shape == (96, 128, 3)
+    for time, frame in enumerate(frames):
+        tiles = frame[24, 32], frame[24, 96], frame[72, 32], frame[72, 96]
+        expected = [20 + 10 * min(time, 2 + number) for number in range(3)] + [255]
+        for tile, grey in zip(tiles, expected, strict=True):
+            assert np.abs(tile - grey).max() <= 4  # compression
+
+
+@pytest.mark.parametrize("index", [[], [0, 2]])
+def test_grid_of_impossible_environments(tmp_path, index):
+    with pytest.raises(ValueError, match="index must"):
+        record_video(FilmedEnv(), policy, tmp_path / "grid.mp4", index=index)

@@ -14,6 +14,7 @@ have been, so a step that counts for n violating ones is n steps long.
 from __future__ import annotations
 
 import contextlib
+import math
 from collections.abc import Callable, Iterator
 
 import torch
@@ -27,6 +28,7 @@ __all__ = [
     "bootstrap_interval",
     "count_violations",
     "evaluate",
+    "proportion_interval",
     "score",
     "summarize",
 ]
@@ -94,6 +96,40 @@ def bootstrap_interval(values: Tensor) -> tuple[float, float]:
     means = values.detach().cpu().double()[rows].mean(-1)
     low, high = means.quantile(torch.tensor([0.025, 0.975], dtype=means.dtype)).tolist()
     return low, high
+
+
+def proportion_interval(successes: int, trials: int) -> tuple[float, float]:
+    """95 % Wilson score interval of the share of successes.
+
+    Unlike the normal interval it says something at zero successes or failures: of 100 episodes
+    without a violation, up to 3.7 % could have had one. Wilson, JASA 1927,
+    https://doi.org/10.1080/01621459.1927.10502953.
+
+    Args:
+        successes (int): how many.
+        trials (int): of how many.
+
+    Returns:
+        tuple of float: lower and upper bound, in [0, 1].
+
+    Raises:
+        ValueError: if there is no trial, or ``successes`` is not between 0 and ``trials``.
+
+    Examples:
+        >>> low, high = proportion_interval(0, 100)
+        >>> low, round(high, 3)
+        (0.0, 0.037)
+    """
+    if trials < 1:
+        raise ValueError(f"trials must be at least 1, got {trials}.")
+    if not 0 <= successes <= trials:
+        raise ValueError(f"successes must be in [0, {trials}], got {successes}.")
+    z = 1.959963984540054  # the 97.5 % quantile of the normal distribution
+    share = successes / trials
+    scale = 1 + z**2 / trials
+    centre = (share + z**2 / (2 * trials)) / scale
+    half = z / scale * math.sqrt(share * (1 - share) / trials + z**2 / (4 * trials**2))
+    return max(0.0, centre - half), min(1.0, centre + half)
 
 
 def evaluate(

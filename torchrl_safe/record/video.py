@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import math
 import os
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import closing
 from pathlib import Path
 
 import imageio.v2 as imageio
 import numpy as np
+import torch
 from tensordict import TensorDictBase
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType
@@ -29,14 +31,16 @@ def record_video(
     fps: float = 25,
     width: int = 480,
     height: int = 360,
-    index: int = 0,
+    index: int | Sequence[int] = 0,
     exploration_type: ExplorationType = ExplorationType.DETERMINISTIC,
+    seed: int | None = None,
 ) -> Path:
     """Plays one episode and writes it as an mp4 (H.264, yuv420p) that browsers play.
 
     The file appears whole or not at all. Pass an environment made for this, never the
-    collector's (see :func:`~torchrl_safe.record.evaluate`), best with a batch of one: all
-    environments of a batch step, one is filmed. The video ends with that one's episode.
+    collector's (see :func:`~torchrl_safe.record.evaluate`), best with no more environments than
+    are filmed: all of a batch step. Several are shown in a grid. The video ends when all filmed
+    episodes have; one that ended earlier keeps its last picture.
 
     Args:
         env (EnvBase): with ``render(index=..., width=..., height=...)`` that returns a uint8
@@ -51,9 +55,10 @@ def record_video(
             time. Defaults to 25, real time for steps of 0.02 s.
         width (int): pixels, even. Defaults to 480.
         height (int): pixels, even. Defaults to 360.
-        index (int): the environment to film. Defaults to 0.
+        index (int or sequence of int): the environments to film. Defaults to 0.
         exploration_type (ExplorationType): how the policy picks its action. Defaults to
             ``DETERMINISTIC``.
+        seed (int, optional): seed of the environment, and of sampled actions.
 
     Returns:
         Path: the video.
@@ -78,10 +83,14 @@ def record_video(
     for name, value in (("width", width), ("height", height)):
         if value < 2 or value % 2:
             raise ValueError(f"{name} must be a positive even number (yuv420p), got {value}.")
-    if not 0 <= index < env.batch_size.numel():
-        raise ValueError(f"index must be in [0, {env.batch_size.numel()}), got {index}.")
+    filmed = [index] if isinstance(index, int) else list(index)
+    if not filmed:
+        raise ValueError("index must name at least one environment, got none.")
+    for i in filmed:
+        if not 0 <= i < env.batch_size.numel():
+            raise ValueError(f"index must be in [0, {env.batch_size.numel()}), got {i}.")
 
-    def frame() -> np.ndarray:
+    def picture(index: int) -> np.ndarray:
         try:
             image = env.render(index=index, width=width, height=height)
             if image.shape != (height, width, 3) or image.dtype != np.uint8:
@@ -107,12 +116,29 @@ def record_video(
             output_params=["-movflags", "+faststart"],
         )
         with acting(exploration_type), closing(writer):
+            if seed is not None:
+                env.set_seed(seed)
+                torch.manual_seed(seed)
             td = env.reset()
+            tiles: dict[int, np.ndarray] = {}
+            running = set(filmed)
             for step in range(num_steps):
                 if step % every == 0:
-                    writer.append_data(frame())
+                    tiles |= {i: picture(i) for i in filmed if i in running}
+                    writer.append_data(_grid([tiles[i] for i in filmed]))
                 stepped, td = env.step_and_maybe_reset(policy(td))
-                if stepped["next", "done"].flatten()[index]:
+                done = stepped["next", "done"].flatten()
+                running -= {i for i in running if done[i]}
+                if not running:
                     break
         os.replace(whole, path)
     return path
+
+
+def _grid(tiles: list[np.ndarray]) -> np.ndarray:
+    """Pictures [h, w, 3] side by side, in lines of equal length; what is left over is white."""
+    columns = math.ceil(math.sqrt(len(tiles)))
+    blank = [np.full_like(tiles[0], 255)] * (-len(tiles) % columns)
+    tiles = tiles + blank
+    lines = [np.hstack(tiles[i : i + columns]) for i in range(0, len(tiles), columns)]
+    return np.vstack(lines)

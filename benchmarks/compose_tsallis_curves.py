@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import argparse
 import csv
+import itertools
 import sys
 from collections import defaultdict
 from pathlib import Path
@@ -21,21 +22,20 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "examples"))
 
 from compose_tsallis import train
 
-INDICES, SEEDS, FRAMES = (1.0, 1.4, 2.0), (0, 1, 2), 6_000
+INDICES, SEEDS, FRAMES = (1.0, 1.4, 2.0), (0, 1, 2), 5_000
 TABLE = Path(__file__).parent / "results" / "compose" / "tsallis_pendulum.csv"
 
 
 def measure() -> None:
-    """Train every index and seed; the table is whole only at the end."""
-    rows = [
-        (index, seed, frames, f"{episode_return:.5g}")
-        for seed in SEEDS
-        for index in INDICES
-        for frames, episode_return in train(index, seed, FRAMES)
-    ]
+    """Train every index and seed."""
     TABLE.parent.mkdir(parents=True, exist_ok=True)
     with TABLE.open("w", newline="") as file:
-        csv.writer(file).writerows([("entropic_index", "seed", "frames", "return"), *rows])
+        writer = csv.writer(file)
+        writer.writerow(("entropic_index", "seed", "frames", "return"))
+        for seed, index in itertools.product(SEEDS, INDICES):
+            for frames, episode_return in train(index, seed, FRAMES):
+                writer.writerow((index, seed, frames, f"{episode_return:.5g}"))
+            file.flush()
 
 
 def plot() -> None:

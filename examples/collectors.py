@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import signal
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import partial
+from typing import Any
 
 import torch
 from omegaconf import DictConfig
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 from torchrl.collectors import (
     BaseCollector,
     Collector,
@@ -32,7 +33,7 @@ def make_collector(
 ) -> BaseCollector:
     """A collector of batches ``[N, T]`` from ``env.num_envs`` environments.
 
-    * ``single``: in this process, before each update.
+    * ``single``: in this process, before each update. Its state can be saved and resumed exactly.
     * ``multi_sync``: in ``collector.num_workers`` processes, which wait during an update.
     * ``multi_async``: the same without waiting: an update sees the batch of one worker,
       ``[N / num_workers, T]``, begun before the update that came before it.
@@ -63,7 +64,7 @@ def make_collector(
     }
     if backend == "single":
         env = make_env(num_envs=cfg.env.num_envs, seed=seed)
-        return Collector(env, policy, auto_register_policy_transforms=False, **options)
+        return ResumableCollector(env, policy, auto_register_policy_transforms=False, **options)
     if num_workers < 1 or cfg.env.num_envs % num_workers:
         raise ValueError(
             f"collector.num_workers={num_workers} must divide env.num_envs={cfg.env.num_envs}."
@@ -78,6 +79,30 @@ def make_collector(
             creators, policy, cat_results="stack", postproc=_joined, **options
         )
     return MultiAsyncCollector(creators, policy, **options)
+
+
+class ResumableCollector(Collector):
+    """A collector whose state holds its environment's: loaded, it goes on with the next step.
+
+    TorchRL's own keeps the transforms' state alone, and starts new episodes. The environment must
+    have a whole ``state_dict``, as :class:`~torchrl_safe.envs.SafeGoalEnv` does.
+    """
+
+    def state_dict(self) -> dict[str, Any]:
+        """The collector's state, the environment's, and what the next action will be drawn for."""
+        return {
+            "collector": super().state_dict(),
+            "env": self.env.state_dict(),
+            "carrier": self._carrier.to_dict(),
+        }
+
+    def load_state_dict(self, state_dict: Mapping[str, Any], **kwargs: Any) -> None:
+        """Put everything back."""
+        super().load_state_dict(state_dict["collector"], **kwargs)
+        self.env.load_state_dict(state_dict["env"])
+        carrier = TensorDict(state_dict["carrier"], self._carrier.batch_size)
+        self._carrier.update(carrier.clone(), inplace=False)
+        self._traj_pool.load_state_dict(state_dict["collector"]["traj_pool"])
 
 
 def worker_seed(seed: int, worker: int) -> int:

@@ -61,7 +61,14 @@ def train(cost_limit: float, seed: int, total_frames: int) -> list[tuple[int, fl
         risk_level=1.0,
     )
     cost_loss.make_value_estimator(gamma=GAMMA, lmbda=0.95)  # +
-    critic_optim = torch.optim.Adam([*critic.parameters(), *cost_loss.cost_network_params.parameters(), *cost_loss.std_network_params.parameters()], lr=3e-3)
+    critic_optim = torch.optim.Adam(
+        [
+            *critic.parameters(),
+            *cost_loss.cost_network_params.parameters(),
+            *cost_loss.std_network_params.parameters(),
+        ],
+        lr=3e-3,
+    )
     policy_optim = TrustRegionSafeOptimizer(
         policy.parameters(),
         max_kl=0.02,
@@ -69,7 +76,13 @@ def train(cost_limit: float, seed: int, total_frames: int) -> list[tuple[int, fl
         statistics_kl=lambda old, new: moment_matched_kl(*old.values(), *new.values()).mean(),
     )
     curve, frames = [], 0
-    for batch in Collector(env, policy, frames_per_batch=3200, total_frames=total_frames, auto_register_policy_transforms=False):
+    for batch in Collector(
+        env,
+        policy,
+        frames_per_batch=3200,
+        total_frames=total_frames,
+        auto_register_policy_transforms=False,
+    ):
         frames += batch.numel()
         with torch.no_grad():
             advantage(batch)
@@ -91,13 +104,21 @@ def train(cost_limit: float, seed: int, total_frames: int) -> list[tuple[int, fl
             dist = policy.get_dist(data)
             ratio = (dist.log_prob(data["action"]) - data["action_log_prob"]).exp()
             mean, cov = dist.moments
-            out = TensorDict(objective=(ratio * data["advantage"].squeeze(-1)).mean(), statistics={"mean": mean, "cov": cov})
+            out = TensorDict(
+                objective=(ratio * data["advantage"].squeeze(-1)).mean(),
+                statistics={"mean": mean, "cov": cov},
+            )
             if cost_limit < 1:
-                out["constraint"] = cost_loss.constraint(data, dist.rsample(noise=noise), reference=reference, level=level)[None]
+                out["constraint"] = cost_loss.constraint(
+                    data, dist.rsample(noise=noise), reference=reference, level=level
+                )[None]
             return out
+
         report = policy_optim.step(closure)
-        curve.append((frames, batch["next","reward"].mean().item(), batch["next","cost"].mean().item()))
-        print(*curve[-1], report.case, round(report.kl,4), losses["cost_value"].item(), flush=True)
+        curve.append(
+            (frames, batch["next", "reward"].mean().item(), batch["next", "cost"].mean().item())
+        )
+        print(*curve[-1], report.case, round(report.kl, 4), losses["cost_value"].item(), flush=True)
     return curve
 
 

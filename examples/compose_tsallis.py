@@ -1,6 +1,6 @@
 """TorchRL's SAC on Pendulum-v1, with ``TsallisLoss`` in the place of ``SACLoss``: one line differs.
 
-    python examples/compose_tsallis.py --entropic-index 1.4   # 1 is SAC itself; about 3 minutes
+python examples/compose_tsallis.py --entropic-index 1.4   # 1 is SAC itself; about 3 minutes
 """
 
 from __future__ import annotations

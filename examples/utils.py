@@ -1,4 +1,10 @@
-"""What the example scripts share: networks, the training loop around an update, a run folder."""
+"""What the example scripts share: networks, the training loop around an update, a run folder.
+
+A trained policy, in two lines::
+
+    from utils import load_policy
+    policy = load_policy("runs/safetac_point/seed_0")
+"""
 
 from __future__ import annotations
 
@@ -14,6 +20,7 @@ from typing import Any
 
 import torch
 from collectors import make_collector
+from config import check_config
 from omegaconf import DictConfig, OmegaConf
 from tensordict import TensorDictBase
 from torch import nn
@@ -43,7 +50,8 @@ EVAL_SEED = 1_000_003
 
 
 def set_up(cfg: DictConfig) -> None:
-    """Threads, seed and a quiet logger: the first thing that a script does."""
+    """Checks the configuration; threads, seed, a quiet logger: what a script does first."""
+    check_config(cfg)
     torchrl_logger.setLevel("WARNING")  # its notes would break the progress bar
     if "OMP_NUM_THREADS" not in os.environ:
         torch.set_num_threads(cfg.num_threads)
@@ -103,13 +111,18 @@ def train(
         eval_env (EnvBase): environments of the evaluations during training.
     """
     cfg = run.cfg
+    in_process = cfg.collector.backend == "single"
+    if not in_process:
+        run.start(policy=policy)  # workers keep no state: a resumed run sees new layouts
     collector = make_collector(
         cfg,
         partial(make_env, cfg, episode_length=cfg.env.episode_length, stagger=True),
         policy,
-        seed=cfg.seed + run.frames,  # a resumed run sees new layouts
+        seed=cfg.seed + run.frames,
         total_frames=cfg.collector.total_frames - run.frames,
     )
+    if in_process:
+        run.start(policy=policy, collector=collector)
     collector.update_policy_weights_()  # workers start with what a checkpoint brought
     progress = tqdm(total=cfg.collector.total_frames, initial=run.frames, unit="frame")
     next_eval, next_save = (
@@ -152,11 +165,12 @@ def train(
             if stop.requested:
                 break
     progress.close()
+    if not stop.requested:
+        run.save()
     collector.shutdown()
     if stop.requested:
         print(f"stopped at {run.frames} frames; go on with the same command and resume=true")
         return
-    run.save()
     final_env = make_env(cfg, cfg.eval.final_episodes, EVAL_SEED)
     run.finish(final_env, policy)
     final_env.close()
@@ -177,6 +191,8 @@ class Counters(dict):
 class Run:
     """A run's folder: resolved config, log, checkpoints, learning curves, results and video.
 
+    Nothing is written before :meth:`start`.
+
     Args:
         cfg (DictConfig): the run's configuration.
         **components: what a checkpoint keeps, besides counters and random state.
@@ -184,7 +200,6 @@ class Run:
     Raises:
         FileExistsError: if the folder holds a run and ``cfg.resume`` is not set.
         FileNotFoundError: if there is nothing to resume.
-        ValueError: if the run to resume has all of its frames.
     """
 
     def __init__(self, cfg: DictConfig, **components: Any) -> None:
@@ -195,6 +210,29 @@ class Run:
         self.rotation = CheckpointRotation(
             self.path / "checkpoints", keep_last=cfg.checkpoint.keep_last
         )
+        if cfg.resume and self.rotation.latest() is None:
+            raise FileNotFoundError(f"run_dir={cfg.run_dir} has no checkpoint to resume from.")
+        if not cfg.resume and (self.path / "config.yaml").exists():
+            raise FileExistsError(
+                f"run_dir={cfg.run_dir} holds a run already: add resume=true to go on with it, or "
+                "choose another run_dir."
+            )
+
+    def start(self, **components: Any) -> None:
+        """Open the folder and the log, and go on from the newest checkpoint if asked to.
+
+        Call it when everything is made: making things draws random numbers, and a resumed run goes
+        on with those that the checkpoint holds.
+
+        Args:
+            **components: the last things that a checkpoint keeps.
+
+        Raises:
+            ValueError: if the run to resume has all of its frames.
+        """
+        cfg = self.cfg
+        for name, component in components.items():
+            self.checkpoint.register(name, component)
         if cfg.resume:
             self.rotation.load_latest(self.checkpoint)
             if self.frames >= cfg.collector.total_frames:
@@ -202,11 +240,6 @@ class Run:
                     f"collector.total_frames={cfg.collector.total_frames} leaves nothing to do: "
                     f"the run in run_dir={cfg.run_dir} has {self.frames} frames."
                 )
-        elif (self.path / "config.yaml").exists():
-            raise FileExistsError(
-                f"run_dir={cfg.run_dir} holds a run already: add resume=true to go on with it, or "
-                "choose another run_dir."
-            )
         self.path.mkdir(parents=True, exist_ok=True)
         OmegaConf.save(cfg, self.path / "config.yaml", resolve=True)
         os.environ.setdefault("WANDB_MODE", "offline")
@@ -289,6 +322,38 @@ class Run:
             except RuntimeError as error:
                 print(f"no video: {error}")
         print(f"results: {self.path}")
+
+
+def load_policy(run_dir: str | os.PathLike[str]) -> GMMTanhPolicy:
+    """The policy of a run, as its newest checkpoint has it.
+
+    Nothing is unpickled: weights are read as tensors, everything else as JSON and YAML.
+
+    Args:
+        run_dir (path): the run's folder.
+
+    Raises:
+        FileNotFoundError: if it holds no run, or one without a checkpoint.
+    """
+    cfg, checkpoint = load_run(run_dir)
+    policy = make_policy(cfg, make_env(cfg, num_envs=1, seed=0))
+    Checkpoint(policy=policy).load(checkpoint)
+    return policy.eval().requires_grad_(False)
+
+
+def load_run(run_dir: str | os.PathLike[str]) -> tuple[DictConfig, Path]:
+    """A run's configuration and the path of its newest checkpoint.
+
+    Raises:
+        FileNotFoundError: if the folder holds no run, or one without a checkpoint.
+    """
+    path = Path(run_dir)
+    if not (path / "config.yaml").exists():
+        raise FileNotFoundError(f"run_dir={run_dir} holds no run: it has no config.yaml.")
+    checkpoint = CheckpointRotation(path / "checkpoints", keep_last=1).latest()
+    if checkpoint is None:
+        raise FileNotFoundError(f"run_dir={run_dir} has no checkpoint yet.")
+    return OmegaConf.load(path / "config.yaml"), checkpoint
 
 
 class GracefulStop:

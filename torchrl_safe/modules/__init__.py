@@ -6,11 +6,14 @@ from torchrl_safe.modules.distributions import (
     TanhGaussianMixture,
     mixture_moments,
 )
+from torchrl_safe.modules.export import DeterministicAction, export_policy
 
 __all__ = [
+    "DeterministicAction",
     "GMMParamExtractor",
     "GMMTanhPolicy",
     "Relaxation",
     "TanhGaussianMixture",
+    "export_policy",
     "mixture_moments",
 ]

@@ -415,6 +415,26 @@ class CVaRCostLoss(LossModule):
         # Trace corrections can make a sampled target of a variance negative.
         return mean_target, variance_target.clamp(min=0).sqrt()
 
+    def predict(self, tensordict: TensorDictBase, action: Tensor) -> tuple[Tensor, Tensor]:
+        """Mean and standard deviation of the discounted cost, ``Q_C(s, a)`` and ``sqrt(V_C)``.
+
+        Gradients reach ``action``, not the critics.
+
+        Args:
+            tensordict (TensorDictBase): holds the critics' inputs but the action, ``[*B]``.
+            action (Tensor): ``[*B, D]``.
+
+        Returns:
+            Mean and standard deviation, in units of the discounted cost sum, ``[*B]`` each.
+        """
+        mean, std = self._predict(
+            tensordict,
+            action,
+            self.cost_network_params.detach(),
+            self.std_network_params.detach(),
+        )
+        return mean.mean(0), std.mean(0)
+
     def cvar(self, tensordict: TensorDictBase, action: Tensor) -> Tensor:
         """CVaR of the discounted cost (7), ``Gamma(s, a)``.
 
@@ -427,13 +447,7 @@ class CVaRCostLoss(LossModule):
         Returns:
             The CVaR, in units of the discounted cost sum, ``[*B]``.
         """
-        mean, std = self._predict(
-            tensordict,
-            action,
-            self.cost_network_params.detach(),
-            self.std_network_params.detach(),
-        )
-        return gaussian_cvar(mean.mean(0), std.mean(0), self.risk_level)
+        return gaussian_cvar(*self.predict(tensordict, action), self.risk_level)
 
     def on_policy_cvar(self, tensordict: TensorDictBase) -> Tensor:
         r"""Mean CVaR of the policy that took the given steps, from the costs it really met.

@@ -1,0 +1,176 @@
+"""What a configuration may hold: every option of every example, checked before anything is made."""
+
+from __future__ import annotations
+
+import difflib
+import math
+from collections.abc import Callable, Iterator, Mapping
+from importlib.util import find_spec
+from numbers import Real
+from typing import Any, NamedTuple
+
+from omegaconf import DictConfig, OmegaConf
+
+from torchrl_safe.envs import ROBOTS
+
+
+class Rule(NamedTuple):
+    """What an option's value must be."""
+
+    holds: Callable[[Any], bool]
+    text: str
+
+
+def integer(low: int) -> Rule:
+    """A whole number of at least ``low``."""
+    return Rule(
+        lambda v: isinstance(v, int) and not isinstance(v, bool) and v >= low,
+        f"an integer of at least {low}",
+    )
+
+
+def number(interval: str) -> Rule:
+    """A finite number in an interval such as ``[0, 1)`` or ``(0, inf)``."""
+    low, high = (float(end) for end in interval[1:-1].split(","))
+    above = float.__gt__ if interval[0] == "(" else float.__ge__
+    below = float.__lt__ if interval[-1] == ")" else float.__le__
+
+    def holds(value: Any) -> bool:
+        if not isinstance(value, Real) or isinstance(value, bool):
+            return False
+        value = float(value)
+        return math.isfinite(value) and above(value, low) and below(value, high)
+
+    return Rule(holds, f"a number in {interval}")
+
+
+def one_of(*choices: Any) -> Rule:
+    """One of the given values."""
+    return Rule(lambda v: v in choices, "one of " + ", ".join(map(repr, choices)))
+
+
+def widths() -> Rule:
+    """Sizes of hidden layers."""
+    return Rule(
+        lambda v: isinstance(v, list) and all(integer(1).holds(n) for n in v),
+        "a list of integers of at least 1",
+    )
+
+
+def bounds() -> Rule:
+    """A pair of rising numbers."""
+    return Rule(
+        lambda v: (
+            isinstance(v, list)
+            and len(v) == 2
+            and all(number("(-inf, inf)").holds(n) for n in v)
+            and v[0] < v[1]
+        ),
+        "two finite numbers, the smaller one first",
+    )
+
+
+BOOLEAN = one_of(True, False)
+PATH = Rule(lambda v: isinstance(v, str) and v != "", "a path")
+
+RULES: dict[str, Rule] = {
+    "seed": integer(0),
+    "num_threads": integer(1),
+    "run_dir": PATH,
+    "resume": BOOLEAN,
+    "env.robot": one_of(*ROBOTS),
+    "env.num_envs": integer(1),
+    "env.episode_length": integer(1),
+    "collector.frames_per_batch": integer(1),
+    "collector.total_frames": integer(1),
+    "collector.init_frames": integer(0),
+    "replay_buffer.size": integer(1),
+    "replay_buffer.slice_len": integer(1),
+    "policy.num_cells": widths(),
+    "policy.num_components": integer(1),
+    "policy.relaxation": one_of("gumbel_softmax", "straight_through", "implicit"),
+    "policy.temperature": number("(0, inf)"),
+    "policy.log_std_bounds": bounds(),
+    "critic.num_cells": widths(),
+    "loss.entropic_index": number("(0, inf)"),
+    "loss.alpha": number("(0, inf)"),
+    "loss.gamma": number("[0, 1)"),
+    "loss.lmbda": number("[0, 1]"),
+    "loss.risk_level": number("(0, 1]"),
+    "loss.cost_limit": number("[0, inf)"),
+    "loss.variance_reward": one_of("td_error", "second_moment"),
+    "optim.critic_lr": number("(0, inf)"),
+    "optim.max_grad_norm": number("(0, inf)"),
+    "optim.critic_rounds": integer(1),
+    "optim.critic_frames": integer(1),
+    "optim.minibatch_size": integer(1),
+    "optim.policy_frames": integer(1),
+    "optim.max_kl": number("(0, inf)"),
+    "optim.damping": number("[0, inf)"),
+    "optim.cg_iters": integer(1),
+    "optim.backtrack_ratio": number("(0, 1)"),
+    "optim.max_backtracks": integer(0),
+    "optim.recovery_ratio": number("(0, 1]"),
+    "logger.backend": one_of("csv", "tensorboard", "wandb", ""),
+    "logger.project_name": Rule(lambda v: isinstance(v, str) and v != "", "a name"),
+    "eval.interval": integer(1),
+    "eval.num_episodes": integer(1),
+    "eval.final_episodes": integer(1),
+    "eval.num_steps": integer(1),
+    "checkpoint.interval": integer(1),
+    "checkpoint.keep_last": integer(1),
+    "video.num_steps": integer(0),
+}
+
+
+def check_config(cfg: DictConfig) -> None:
+    """Fail at once, with the name of the option and what is allowed.
+
+    Raises:
+        ValueError: if an option is unknown, its value is impossible, or two do not go together.
+        ModuleNotFoundError: if the logger's package is not installed.
+    """
+    options = dict(_flat(OmegaConf.to_container(cfg, resolve=True)))
+    for name, value in options.items():
+        if name not in RULES:
+            close = difflib.get_close_matches(name, RULES) or sorted(RULES)
+            raise ValueError(f"{name} is not an option; there are {', '.join(close)}.")
+        rule = RULES[name]
+        if not rule.holds(value):
+            raise ValueError(f"{name} must be {rule.text}, got {value!r}.")
+    _check_together(options)
+    backend = options["logger.backend"]
+    if backend in ("tensorboard", "wandb") and find_spec(backend) is None:
+        raise ModuleNotFoundError(
+            f"logger.backend={backend} needs a package: pip install 'torchrl-safe[{backend}]'; "
+            "logger.backend=csv needs none."
+        )
+
+
+def _check_together(options: Mapping[str, Any]) -> None:
+    """Options that depend on one another; those that a configuration lacks are not checked."""
+    for name, divisor in (
+        ("collector.frames_per_batch", "env.num_envs"),
+        ("optim.critic_frames", "replay_buffer.slice_len"),
+    ):
+        if {name, divisor} <= options.keys() and options[name] % options[divisor]:
+            raise ValueError(
+                f"{name} must be a multiple of {divisor}={options[divisor]}, got {options[name]}."
+            )
+    for name, ceiling in (
+        ("replay_buffer.slice_len", "env.episode_length"),
+        ("collector.frames_per_batch", "replay_buffer.size"),
+        ("optim.critic_frames", "replay_buffer.size"),
+    ):
+        if {name, ceiling} <= options.keys() and options[name] > options[ceiling]:
+            raise ValueError(
+                f"{name} must be at most {ceiling}={options[ceiling]}, got {options[name]}."
+            )
+
+
+def _flat(options: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    for name, value in options.items():
+        if isinstance(value, Mapping):
+            yield from _flat(value, f"{prefix}{name}.")
+        else:
+            yield prefix + name, value

@@ -1,0 +1,144 @@
+"""What became of a run: scores, failures, a map, a film, and whether its safety critic is right.
+
+    python examples/evaluate.py runs/safetac_point/seed_0
+    python examples/evaluate.py runs/safetac_point/seed_0 --episodes 400 --seed 7
+
+Writes ``evaluation/`` in the run's folder and prints a table. The layouts are others than those of
+training and of the run's own evaluations.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+
+import torch
+from critics import make_losses
+from omegaconf import DictConfig
+from tensordict import TensorDictBase
+from torchrl.checkpoint import Checkpoint
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+from utils import load_policy, load_run, make_env
+
+from torchrl_safe import CVaRCostLoss, GMMTanhPolicy
+from torchrl_safe.envs import SafeGoalEnv
+from torchrl_safe.record import (
+    calibrate,
+    evaluate,
+    format_table,
+    plot_calibration,
+    plot_trajectories,
+    proportion_interval,
+    record_trajectories,
+    record_video,
+    summarize,
+)
+
+NUM_FILMED = 9
+
+
+def load_cost_loss(
+    cfg: DictConfig, checkpoint: Path, env: SafeGoalEnv, policy: GMMTanhPolicy
+) -> CVaRCostLoss | None:
+    """The run's safety critics; None if it trained none."""
+    if "cost_loss" not in Checkpoint.manifest(checkpoint)["components"]:
+        return None
+    _, cost_loss = make_losses(cfg, env, policy)
+    Checkpoint(cost_loss=cost_loss).load(checkpoint)
+    return cost_loss
+
+
+def shares(episodes: TensorDictBase, prefix: str) -> dict[str, float]:
+    """How many episodes met a goal, and how many violated, each with its 95 % interval."""
+    metrics = {}
+    for name, met in (("success", episodes["goals"] > 0), ("failure", episodes["violations"] > 0)):
+        count, total = int(met.sum()), met.numel()
+        low, high = proportion_interval(count, total)
+        metrics |= {
+            f"{prefix}{name}_rate": count / total,
+            f"{prefix}{name}_rate_low": low,
+            f"{prefix}{name}_rate_high": high,
+        }
+    return metrics
+
+
+def calibration(
+    env: SafeGoalEnv, policy: GMMTanhPolicy, cost_loss: CVaRCostLoss, num_steps: int, seed: int
+) -> TensorDictBase:
+    """The critics' predictions beside realised cost sums, under the policy they describe."""
+    with torch.no_grad(), set_exploration_type(ExplorationType.RANDOM):
+        env.set_seed(seed)
+        torch.manual_seed(seed)
+        steps = env.rollout(num_steps, policy, break_when_any_done=False)
+        mean, _ = cost_loss.predict(steps, steps["action"])
+        cvar = cost_loss.cvar(steps, steps["action"])
+    return calibrate(
+        mean,
+        cvar,
+        steps["next", "cost"].squeeze(-1),
+        gamma=float(cost_loss.value_estimator.gamma),
+        risk_level=cost_loss.risk_level,
+    )
+
+
+def main(run_dir: Path, episodes: int, seed: int, film: bool) -> dict[str, float]:
+    """Evaluate, draw, and return the numbers."""
+    cfg, checkpoint = load_run(run_dir)
+    policy = load_policy(run_dir)
+    num_steps, out = cfg.eval.num_steps, run_dir / "evaluation"
+    env = make_env(cfg, episodes, seed, episode_length=num_steps)
+    metrics: dict[str, float] = {}
+    for prefix, kind in (("det/", "DETERMINISTIC"), ("sampled/", "RANDOM")):
+        played = evaluate(
+            env, policy, num_steps=num_steps, exploration_type=ExplorationType[kind], seed=seed
+        )
+        metrics |= summarize(played, prefix) | shares(played, prefix)
+    filmed = min(episodes, NUM_FILMED)
+    plot_trajectories(
+        record_trajectories(env, policy, num_steps=num_steps, num_episodes=filmed, seed=seed),
+        out / "trajectories.png",
+    )
+    cost_loss = load_cost_loss(cfg, checkpoint, env, policy)
+    if cost_loss is not None:
+        try:
+            bins = calibration(env, policy, cost_loss, num_steps, seed)
+        except ValueError as error:
+            print(f"no calibration: {error}")
+        else:
+            plot_calibration(bins, out / "calibration.png")
+            for name in ("mean", "cvar"):
+                error = bins[f"predicted_{name}"] - bins[f"realised_{name}"]
+                metrics[f"calibration/{name}_bias"] = error.mean().item()
+                metrics[f"calibration/{name}_error"] = error.abs().mean().item()
+    (out / "results.json").write_text(json.dumps(metrics, indent=2) + "\n")
+    print(format_table(metrics))
+    if film:
+        small = make_env(cfg, filmed, seed, episode_length=num_steps)
+        try:
+            record_video(
+                small,
+                policy,
+                out / "video.mp4",
+                num_steps=num_steps,
+                every=4,
+                width=320,
+                height=240,
+                index=range(filmed),
+                seed=seed,
+            )
+        except RuntimeError as error:
+            print(f"no video: {error}")
+        small.close()
+    env.close()
+    print(f"written to {out}")
+    return metrics
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("run_dir", type=Path)
+    parser.add_argument("--episodes", type=int, default=100)
+    parser.add_argument("--seed", type=int, default=2_000_003, help="of the layouts")
+    parser.add_argument("--film", action=argparse.BooleanOptionalAction, default=True)
+    main(**vars(parser.parse_args()))

@@ -1,4 +1,4 @@
-"""Learning curves of ``examples/compose_tsallis.py`` for several entropic indices, and their picture.
+"""Learning curves of ``examples/compose_tsallis.py`` for entropic indices 1, 1.4 and 2.
 
     python benchmarks/compose_tsallis_curves.py  # about 15 minutes on one core
 

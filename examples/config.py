@@ -70,6 +70,11 @@ def bounds() -> Rule:
     )
 
 
+def optional(rule: Rule) -> Rule:
+    """As the rule says, or null."""
+    return Rule(lambda v: v is None or rule.holds(v), f"null or {rule.text}")
+
+
 BOOLEAN = one_of(True, False)
 PATH = Rule(lambda v: isinstance(v, str) and v != "", "a path")
 
@@ -95,9 +100,12 @@ RULES: dict[str, Rule] = {
     "loss.entropic_index": number("(0, inf)"),
     "loss.alpha": number("(0, inf)"),
     "loss.gamma": number("[0, 1)"),
+    "loss.cost_gamma": number("[0, 1)"),
     "loss.lmbda": number("[0, 1]"),
     "loss.risk_level": number("(0, 1]"),
     "loss.cost_limit": number("[0, inf)"),
+    "loss.initial_cost_limit": number("[0, inf)"),
+    "loss.anneal_frames": integer(0),
     "loss.variance_reward": one_of("td_error", "second_moment"),
     "optim.critic_lr": number("(0, inf)"),
     "optim.max_grad_norm": number("(0, inf)"),
@@ -105,6 +113,7 @@ RULES: dict[str, Rule] = {
     "optim.critic_frames": integer(1),
     "optim.minibatch_size": integer(1),
     "optim.policy_frames": integer(1),
+    "optim.curvature_frames": optional(integer(1)),
     "optim.max_kl": number("(0, inf)"),
     "optim.damping": number("[0, inf)"),
     "optim.cg_iters": integer(1),

@@ -2,8 +2,8 @@
 
     python examples/run_exported.py runs/safetac_point/seed_0/policy.onnx
 
-Nothing of the policy's code is imported. The file maps observations ``[B, D]`` to actions ``[B, A]``,
-float32; on a robot, the loop below is all there is.
+Nothing of the policy's code is imported. The file maps observations ``[B, D]`` to actions
+``[B, A]``, float32; on a robot, the loop below is all there is.
 """
 
 from __future__ import annotations

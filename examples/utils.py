@@ -129,6 +129,7 @@ def train(
         run.frames // interval * interval + interval
         for interval in (cfg.eval.interval, cfg.checkpoint.interval)
     )
+    timeit.erase()  # what was timed before is not the run's
     started = time.perf_counter()
     with GracefulStop() as stop:
         for batch in collector:

@@ -3,13 +3,15 @@
     python examples/watch.py runs/safetac_point/seed_0            # until Ctrl-C
     python examples/watch.py runs/safetac_point/seed_0 --once
 
-The picture is ``curves.png`` in the run's folder; most viewers and editors follow the file. It reads
-the csv log; other backends have viewers of their own (``tensorboard --logdir``, ``wandb sync``).
+The picture is ``curves.png`` in the run's folder; most viewers and editors follow the file. It
+reads the csv log; other backends have viewers of their own (``tensorboard --logdir``, ``wandb
+sync``).
 """
 
 from __future__ import annotations
 
 import argparse
+import contextlib
 import time
 from pathlib import Path
 
@@ -57,7 +59,5 @@ if __name__ == "__main__":
     parser.add_argument("run_dir", type=Path)
     parser.add_argument("--every", type=float, default=30.0, help="seconds between two pictures")
     parser.add_argument("--once", action="store_true")
-    try:
+    with contextlib.suppress(KeyboardInterrupt):
         main(**vars(parser.parse_args()))
-    except KeyboardInterrupt:
-        pass

@@ -9,6 +9,7 @@ import sys
 from pathlib import Path
 
 import hydra
+import numpy as np
 import pytest
 import safetac_point
 import torch
@@ -144,9 +145,26 @@ class TestResume:
         assert (total[1:] >= total[:-1]).all()
         assert json.loads((run_dir / "results.json").read_text())["frames"] == 2000
 
+    def test_continues_exactly(self, finished, tmp_path, interrupted):
+        """Interrupted in the middle of episodes, and resumed: the same metrics to the last bit."""
+        run_dir = tmp_path / "run"
+        interrupted(signal.SIGINT)
+        launch(run_dir, "collector.total_frames=1600", "checkpoint.interval=100000")
+        launch(run_dir, "collector.total_frames=1600", "resume=true")
+        whole, parts = (record.read_metrics(path / "log") for path in (finished, run_dir))
+        assert whole.keys() == parts.keys()
+        for name in whole:
+            if not name.startswith("time/"):
+                for expected, got in zip(whole[name], parts[name], strict=True):
+                    np.testing.assert_array_equal(got, expected, err_msg=name)
+        first, second = (json.loads((p / "results.json").read_text()) for p in (finished, run_dir))
+        for name in first.keys() - {"seconds", "frames_per_second"}:
+            assert first[name] == second[name]
+
     def test_nothing_to_resume(self, tmp_path):
-        with pytest.raises(FileNotFoundError, match="No checkpoints were found"):
+        with pytest.raises(FileNotFoundError, match="has no checkpoint to resume from"):
             launch(tmp_path / "run", "resume=true")
+        assert not (tmp_path / "run").exists()
 
 
 class TestReplay:
@@ -199,10 +217,8 @@ class TestMisuse:
         ("override", "message"),
         [
             ("loss.cost_limt=1", "cost_limt"),
-            ("loss.cost_limit=-1", "cost_limit must be finite and at least 0, got -1"),
-            ("loss.risk_level=2", r"risk_level must be in \(0, 1\], got 2"),
-            ("loss.entropic_index=0", "entropic_index must be"),
-            ("optim.max_kl=0", "max_kl"),
+            ("+loss.cost_limt=1", "cost_limt is not an option; there are loss.cost_limit"),
+            ("loss.cost_limit=-1", r"cost_limit must be a number in \[0, inf\), got -1"),
             ("env.robot=unicycle", "unicycle"),
             ("replay_buffer.storage=disk", "must be memory or memmap, got 'disk'"),
         ],

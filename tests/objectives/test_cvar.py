@@ -301,6 +301,12 @@ class TestConstraint:
         torch.testing.assert_close(loss.cvar(data, data["action"]), gamma.squeeze(-1))
         torch.testing.assert_close(loss.constraint(data, data["action"]), gamma.mean() - 1.5)
 
+    def test_predictions(self):
+        loss, data = make_loss(num_cost_nets=2), make_data()
+        expected = predictions(loss, data, data["action"])
+        for got, value in zip(loss.predict(data, data["action"]), expected, strict=True):
+            torch.testing.assert_close(got, value.squeeze(-1))
+
     def test_gradient_reaches_the_policy_alone(self):
         loss, data = make_loss(), make_data()
         action = loss.actor_network.get_dist(data).rsample()

@@ -43,7 +43,7 @@ def test_goals_in_their_order(env):
     td = env.reset()
     state = env.state_dict()
     robot = env.layout(0)["robot"]
-    state["goal"][0] = torch.tensor(robot + [0.1, 0.0])  # reached at the first step
+    state["goal"][0] = torch.tensor([robot[0] + 0.1, robot[1]])  # reached at the first step
     state["goal_distance"][0] = 0.1
 
     class Placed:
@@ -58,7 +58,7 @@ def test_goals_in_their_order(env):
             return td
 
     (only,) = record_trajectories(Placed(), ahead, num_steps=3, num_episodes=1)
-    np.testing.assert_allclose(only["goals"][0], robot + [0.1, 0.0])
+    np.testing.assert_allclose(only["goals"][0], [robot[0] + 0.1, robot[1]])
     assert len(only["goals"]) == 2
     np.testing.assert_array_equal(only["goals"][1], env.layout(0)["goal"])
 

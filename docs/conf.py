@@ -1,0 +1,58 @@
+"""Sphinx configuration: ``sphinx-build -W -b html docs docs/_build/html``."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+from sphinx.application import Sphinx
+
+project = "torchrl_safe"
+author = "the torchrl_safe authors"
+html_title = project
+
+extensions = [
+    "myst_parser",
+    "sphinx.ext.autodoc",
+    "sphinx.ext.mathjax",
+    "sphinx.ext.napoleon",
+    "sphinx.ext.viewcode",
+]
+exclude_patterns = ["_build"]
+html_theme = "furo"
+html_static_path: list[str] = []
+
+myst_enable_extensions = ["amsmath", "dollarmath"]
+myst_heading_anchors = 4
+
+autodoc_member_order = "bysource"
+autodoc_typehints = "signature"
+autodoc_default_options = {"members": True, "show-inheritance": True}
+# A name is shown as its users import it, not as the file it lives in.
+add_module_names = False
+napoleon_google_docstring = True
+napoleon_numpy_docstring = False
+napoleon_custom_sections = [("Keyword Args", "params_style")]
+napoleon_use_ivar = True
+
+# Links of readers of the repository, which the site has no page for: folders, other Markdown.
+_LINK = re.compile(r"\[([^\]]+)\]\((\.\./[^)#\s]+)(?:#[^)]*)?\)")
+
+
+def _name_what_has_no_page(app: Sphinx, docname: str, source: list[str]) -> None:
+    """Such a link becomes its text; one that leads nowhere stays, and fails the build."""
+    folder = Path(app.srcdir, docname).parent
+
+    def replace(match: re.Match[str]) -> str:
+        text, target = match.groups()
+        path = (folder / target).resolve()
+        outside = not path.is_relative_to(Path(app.srcdir).resolve())
+        has_page = path.is_file() and path.suffix != ".md"
+        return text if outside and path.exists() and not has_page else match.group()
+
+    source[0] = _LINK.sub(replace, source[0])
+
+
+def setup(app: Sphinx) -> None:
+    """Register the hook."""
+    app.connect("source-read", _name_what_has_no_page)

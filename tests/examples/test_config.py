@@ -1,0 +1,90 @@
+from __future__ import annotations
+
+from importlib import util
+from pathlib import Path
+
+import config
+import hydra
+import pytest
+from omegaconf import OmegaConf, open_dict
+
+EXAMPLES = Path(config.__file__).parent
+CONFIGS = sorted(path.stem for path in EXAMPLES.glob("*.yaml"))
+
+
+def compose(name, *overrides):
+    with hydra.initialize_config_dir(str(EXAMPLES), version_base="1.3"):
+        return hydra.compose(name, list(overrides))
+
+
+def options(node, prefix=""):
+    for name, value in node.items():
+        if isinstance(value, dict):
+            yield from options(value, f"{prefix}{name}.")
+        else:
+            yield prefix + name
+
+
+@pytest.mark.parametrize("name", CONFIGS)
+class TestEveryConfiguration:
+    def test_is_valid(self, name):
+        config.check_config(compose(name))
+
+    def test_every_option_has_a_rule(self, name):
+        cfg = OmegaConf.to_container(compose(name), resolve=True)
+        missing = set(options(cfg)) - set(config.RULES)
+        assert not missing, f"examples/config.py has no rule for {sorted(missing)}"
+
+    def test_every_option_says_what_it_is(self, name):
+        """A comment on its line, or in the line above."""
+        lines = (EXAMPLES / f"{name}.yaml").read_text().splitlines()
+        silent = []
+        for number, line in enumerate(lines):
+            key, colon, value = line.partition(":")
+            if line.startswith(("hydra:", "defaults:")):
+                break
+            is_option = colon and value.split("#")[0].strip() and not key.strip().startswith("#")
+            if is_option and "#" not in line and not lines[number - 1].strip().startswith("#"):
+                silent.append(key.strip())
+        assert not silent, f"{name}.yaml does not say what these are: {silent}"
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "message"),
+    [
+        ("seed", -1, "seed must be an integer of at least 0, got -1"),
+        ("seed", True, "seed must be an integer of at least 0, got True"),
+        ("num_threads", 1.5, "num_threads must be an integer of at least 1, got 1.5"),
+        ("env.robot", "unicycle", "env.robot must be one of 'point'.*got 'unicycle'"),
+        ("loss.risk_level", 2, r"loss.risk_level must be a number in \(0, 1\], got 2"),
+        ("loss.gamma", 1.0, r"loss.gamma must be a number in \[0, 1\), got 1.0"),
+        ("loss.gamma", "high", "loss.gamma must be a number.*got 'high'"),
+        ("loss.cost_limit", float("nan"), r"loss.cost_limit must be a number in \[0, inf\)"),
+        ("optim.max_kl", 0, r"optim.max_kl must be a number in \(0, inf\), got 0"),
+        ("policy.num_cells", [64, 0], "policy.num_cells must be a list of integers"),
+        ("policy.log_std_bounds", [2, -4], "policy.log_std_bounds must be two finite numbers"),
+        ("logger.backend", "wandbb", "logger.backend must be one of 'csv', 'tensorboard', 'wandb'"),
+        ("resume", "yes", "resume must be one of True, False, got 'yes'"),
+        ("run_dir", "", "run_dir must be a path"),
+        ("loss.cost_limt", 1.0, "loss.cost_limt is not an option; there are loss.cost_limit"),
+        ("collector.frames_per_batch", 8001, "must be a multiple of env.num_envs=400, got 8001"),
+        ("optim.critic_frames", 15_001, "must be a multiple of replay_buffer.slice_len=20"),
+        ("env.episode_length", 10, "slice_len must be at most env.episode_length=10, got 20"),
+        ("replay_buffer.size", 800, "frames_per_batch must be at most replay_buffer.size=800"),
+    ],
+)
+def test_message(name, value, message):
+    cfg = compose("safetac_point")
+    with open_dict(cfg):
+        OmegaConf.update(cfg, name, value)
+    with pytest.raises(ValueError, match=message):
+        config.check_config(cfg)
+
+
+@pytest.mark.parametrize("backend", ["wandb", "tensorboard"])
+def test_missing_extra(monkeypatch, backend):
+    monkeypatch.setattr(
+        config, "find_spec", lambda name: None if name == backend else util.find_spec(name)
+    )
+    with pytest.raises(ModuleNotFoundError, match=rf"pip install 'torchrl-safe\[{backend}\]'"):
+        config.check_config(compose("safetac_point", f"logger.backend={backend}"))

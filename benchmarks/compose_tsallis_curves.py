@@ -47,7 +47,7 @@ def plot() -> None:
     figure = Figure(figsize=(7, 4), layout="constrained")
     axes = figure.subplots()
     colours = ("#0072B2", "#D55E00", "#009E73")
-    for (index, seeds), colour in zip(sorted(curves.items()), colours, strict=True):
+    for (index, seeds), colour in zip(sorted(curves.items()), colours, strict=False):
         returns = np.array(list(seeds.values())).reshape(len(seeds), -1, 5).mean(-1)
         frames = 1_000 * np.arange(1, returns.shape[1] + 1)
         axes.plot(frames, returns.mean(0), color=colour, label=f"q = {float(index):g}")

@@ -9,6 +9,7 @@ from importlib.util import find_spec
 from numbers import Real
 from typing import Any, NamedTuple
 
+from collectors import BACKENDS
 from omegaconf import DictConfig, OmegaConf
 
 from torchrl_safe.envs import ROBOTS
@@ -86,9 +87,12 @@ RULES: dict[str, Rule] = {
     "env.robot": one_of(*ROBOTS),
     "env.num_envs": integer(1),
     "env.episode_length": integer(1),
+    "collector.backend": one_of(*BACKENDS),
+    "collector.num_workers": integer(1),
     "collector.frames_per_batch": integer(1),
     "collector.total_frames": integer(1),
     "collector.init_frames": integer(0),
+    "replay_buffer.storage": one_of("memory", "memmap"),
     "replay_buffer.size": integer(1),
     "replay_buffer.slice_len": integer(1),
     "policy.num_cells": widths(),

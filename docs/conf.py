@@ -5,7 +5,10 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
+from docutils import nodes
+from latex2mathml.converter import convert
 from sphinx.application import Sphinx
+from sphinx.writers.html5 import HTML5Translator
 
 project = "torchrl_safe"
 author = "the torchrl_safe authors"
@@ -14,12 +17,12 @@ html_title = project
 extensions = [
     "myst_parser",
     "sphinx.ext.autodoc",
-    "sphinx.ext.mathjax",
     "sphinx.ext.napoleon",
     "sphinx.ext.viewcode",
 ]
 exclude_patterns = ["_build"]
 html_theme = "furo"
+html_math_renderer = "mathml"
 html_static_path: list[str] = []
 
 myst_enable_extensions = ["amsmath", "dollarmath"]
@@ -53,6 +56,18 @@ def _name_what_has_no_page(app: Sphinx, docname: str, source: list[str]) -> None
     source[0] = _LINK.sub(replace, source[0])
 
 
+def _inline_math(translator: HTML5Translator, node: nodes.math) -> None:
+    """Formulas as MathML, which browsers draw themselves: no script, no network."""
+    translator.body.append(convert(node.astext()))
+    raise nodes.SkipNode
+
+
+def _display_math(translator: HTML5Translator, node: nodes.math_block) -> None:
+    translator.body.append(f"<p>{convert(node.astext(), display='block')}</p>")
+    raise nodes.SkipNode
+
+
 def setup(app: Sphinx) -> None:
-    """Register the hook."""
+    """Register the hook and the formulas."""
     app.connect("source-read", _name_what_has_no_page)
+    app.add_html_math_renderer("mathml", (_inline_math, None), (_display_math, None))

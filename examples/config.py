@@ -78,12 +78,14 @@ def optional(rule: Rule) -> Rule:
 
 BOOLEAN = one_of(True, False)
 PATH = Rule(lambda v: isinstance(v, str) and v != "", "a path")
+NAME = Rule(lambda v: isinstance(v, str) and v != "", "a name")
 
 RULES: dict[str, Rule] = {
     "seed": integer(0),
     "num_threads": integer(1),
     "run_dir": PATH,
     "resume": BOOLEAN,
+    "env.name": NAME,
     "env.robot": one_of(*ROBOTS),
     "env.num_envs": integer(1),
     "env.episode_length": integer(1),
@@ -95,6 +97,11 @@ RULES: dict[str, Rule] = {
     "replay_buffer.storage": one_of("memory", "memmap"),
     "replay_buffer.size": integer(1),
     "replay_buffer.slice_len": integer(1),
+    "replay_buffer.batch_size": integer(1),
+    "estimator.name": one_of("retrace", "td0"),
+    "estimator.gamma": number("[0, 1)"),
+    "estimator.lmbda": number("[0, 1]"),
+    "network.num_cells": widths(),
     "policy.num_cells": widths(),
     "policy.num_components": integer(1),
     "policy.relaxation": one_of("gumbel_softmax", "straight_through", "implicit"),
@@ -103,6 +110,8 @@ RULES: dict[str, Rule] = {
     "critic.num_cells": widths(),
     "loss.entropic_index": number("(0, inf)"),
     "loss.alpha": number("(0, inf)"),
+    "loss.alpha_init": number("(0, inf)"),
+    "loss.target_update_tau": number("(0, 1]"),
     "loss.gamma": number("[0, 1)"),
     "loss.cost_gamma": number("[0, 1)"),
     "loss.lmbda": number("[0, 1]"),
@@ -111,6 +120,8 @@ RULES: dict[str, Rule] = {
     "loss.initial_cost_limit": number("[0, inf)"),
     "loss.anneal_frames": integer(0),
     "loss.variance_reward": one_of("td_error", "second_moment"),
+    "optim.lr": number("(0, inf)"),
+    "optim.updates_per_frame": number("(0, inf)"),
     "optim.critic_lr": number("(0, inf)"),
     "optim.max_grad_norm": number("(0, inf)"),
     "optim.critic_rounds": integer(1),
@@ -125,7 +136,7 @@ RULES: dict[str, Rule] = {
     "optim.max_backtracks": integer(0),
     "optim.recovery_ratio": number("(0, 1]"),
     "logger.backend": one_of("csv", "tensorboard", "wandb", ""),
-    "logger.project_name": Rule(lambda v: isinstance(v, str) and v != "", "a name"),
+    "logger.project_name": NAME,
     "eval.interval": integer(1),
     "eval.num_episodes": integer(1),
     "eval.final_episodes": integer(1),
@@ -152,7 +163,7 @@ def check_config(cfg: DictConfig) -> None:
         if not rule.holds(value):
             raise ValueError(f"{name} must be {rule.text}, got {value!r}.")
     _check_together(options)
-    backend = options["logger.backend"]
+    backend = options.get("logger.backend")
     if backend in ("tensorboard", "wandb") and find_spec(backend) is None:
         raise ModuleNotFoundError(
             f"logger.backend={backend} needs a package: pip install 'torchrl-safe[{backend}]'; "
@@ -165,6 +176,7 @@ def _check_together(options: Mapping[str, Any]) -> None:
     for name, divisor in (
         ("collector.frames_per_batch", "env.num_envs"),
         ("optim.critic_frames", "replay_buffer.slice_len"),
+        ("replay_buffer.batch_size", "replay_buffer.slice_len"),
     ):
         if {name, divisor} <= options.keys() and options[name] % options[divisor]:
             raise ValueError(

@@ -17,6 +17,7 @@ from pathlib import Path
 
 import hydra
 import torch
+from config import check_config
 from omegaconf import DictConfig, OmegaConf
 from tensordict import TensorDictBase
 from tensordict.nn import NormalParamExtractor, TensorDictModule
@@ -80,6 +81,7 @@ def mean_trace(actor: ProbabilisticActor, batch: TensorDictBase) -> Tensor:
 @hydra.main(config_path=".", config_name="retrace_sac", version_base="1.3")
 def main(cfg: DictConfig) -> None:
     """Train an agent and write its learning curve."""
+    check_config(cfg)
     torchrl_logger.setLevel("WARNING")  # its notes would break the progress bar
     torch.set_num_threads(1)
     torch.manual_seed(cfg.seed)

@@ -22,7 +22,7 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "examples"))
 
 from compose_tsallis import train
 
-INDICES, SEEDS, FRAMES = (1.0, 1.4, 2.0), (0, 1, 2), 5_000
+INDICES, SEEDS, FRAMES = (1.0, 1.4, 2.0), (0,), 5_000
 TABLE = Path(__file__).parent / "results" / "compose" / "tsallis_pendulum.csv"
 
 

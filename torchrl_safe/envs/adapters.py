@@ -22,17 +22,17 @@ __all__ = ["CostToReward", "cost_from_info"]
 
 
 class CostToReward(Transform):
-    """Moves a cost from the observations into the reward spec, shape [*B, 1], float32.
+    """Moves a cost from the observations into the reward spec, shape ``[*B, 1]``, float32.
 
     A cost that the environment also shows at a reset is no cost of a step: it is left out there.
 
     Args:
         cost_key (NestedKey): where the environment writes the cost, one number per environment, of
-            any dtype, shape [*B] or [*B, 1]. The leaf of the reward spec has the same name.
+            any dtype, shape ``[*B]`` or ``[*B, 1]``. The leaf of the reward spec has the same name.
             Default: ``"cost"``.
 
     Keyword Args:
-        violation_key (NestedKey, optional): a bool entry [*B, 1] to write among the observations,
+        violation_key (NestedKey, optional): a bool entry ``[*B, 1]`` to write among the observations,
             true where the cost of the step is above ``violation_above``; false after a reset.
             ``None`` writes none. Default: ``"violation"``.
         violation_above (float): Default: 0, right for a binary cost. For a smooth one, say where

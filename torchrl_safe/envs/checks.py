@@ -35,9 +35,9 @@ def check_safe_env(
     In this order; the first broken promise raises:
 
     1. ``check_env_specs`` of TorchRL succeeds;
-    2. the cost is a leaf of the reward spec, [*B, 1], float32; it is finite, as reward and
+    2. the cost is a leaf of the reward spec, ``[*B, 1]``, float32; it is finite, as reward and
        observation are;
-    3. the violation is an observation, [*B, 1], bool;
+    3. the violation is an observation, ``[*B, 1]``, bool;
     4. ``done`` is ``terminated | truncated``, and a time limit truncates without terminating;
     5. the same seed and actions give the same rollout, whatever happened before;
     6. what a step returned is not written to by later steps;

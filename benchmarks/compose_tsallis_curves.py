@@ -1,6 +1,6 @@
 """Learning curves of ``examples/compose_tsallis.py`` for entropic indices 1, 1.4 and 2.
 
-    python benchmarks/compose_tsallis_curves.py  # about 15 minutes on one core
+    python benchmarks/compose_tsallis_curves.py  # about 5 minutes on one idle core
 
 Writes ``benchmarks/results/compose/tsallis_pendulum.csv`` and the picture beside it. ``--plot``
 only draws what is there.

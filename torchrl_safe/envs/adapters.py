@@ -32,7 +32,7 @@ class CostToReward(Transform):
             Default: ``"cost"``.
 
     Keyword Args:
-        violation_key (NestedKey, optional): a bool entry ``[*B, 1]`` to write among the observations,
+        violation_key (NestedKey, optional): bool ``[*B, 1]``, to write among the observations,
             true where the cost of the step is above ``violation_above``; false after a reset.
             ``None`` writes none. Default: ``"violation"``.
         violation_above (float): Default: 0, right for a binary cost. For a smooth one, say where

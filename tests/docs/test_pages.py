@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import re
+import sys
 from pathlib import Path
+from types import ModuleType
 
 import pytest
 import torch
@@ -26,4 +28,6 @@ def test_block_runs(block, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     torch.manual_seed(0)
     # Not "__main__": what starts processes is for a script of its own.
-    exec(compile(block, "block", "exec"), {"__name__": "page"})
+    page = ModuleType("page")
+    monkeypatch.setitem(sys.modules, "page", page)  # dataclasses look their module up
+    exec(compile(block, "block", "exec"), vars(page))

@@ -18,6 +18,7 @@ __all__ = [
     "gaussian_cvar",
     "moment_matched_kl",
     "q_logarithm",
+    "surrogate_change",
     "uniform_tsallis_entropy",
 ]
 
@@ -161,6 +162,58 @@ def discounted_cost_limit(cost_rate: float, gamma: float) -> float:
     if not 0 <= gamma < 1:
         raise ValueError(f"gamma must be in [0, 1), got {gamma}.")
     return cost_rate / (1 - gamma)
+
+
+def surrogate_change(
+    log_prob: Tensor, log_pi: Tensor, log_mu: Tensor, advantage: Tensor, gamma: float
+) -> Tensor:
+    r"""Change of a discounted sum from one policy to another, to first order.
+
+    .. math::
+
+        J(\pi') - J(\pi) \approx \frac{1}{1 - \gamma} E_{s, a \sim \mu}\left[
+            \left(\frac{\pi'(a|s)}{\pi(a|s)} - 1\right)
+            \min\left(1, \frac{\pi(a|s)}{\mu(a|s)}\right) A^\pi(s, a)\right]
+
+    The surrogate of TRPO and CPO (Achiam et al. 2017, https://arxiv.org/abs/1705.10528, corollaries
+    1 and 2) is the case ``mu = pi``. At ``pi' = pi`` it is 0 and its gradient is the policy
+    gradient, *in the unit of J*: the factor ``1 / (1 - gamma)`` belongs to it wherever it is
+    compared with a limit on ``J``. States count as often as they are visited, see
+    :class:`~torchrl_safe.objectives.CVaRSurrogateLoss`. Advantages are centred, which in
+    expectation changes nothing.
+
+    Args:
+        log_prob (Tensor): log-density of the stored action under ``pi'``, ``[*B]``.
+        log_pi (Tensor): under ``pi``, ``[*B]``.
+        log_mu (Tensor): under the policy that took it, ``[*B]``.
+        advantage (Tensor): of ``pi``, ``[*B]``.
+        gamma (float): discount of ``J``, in [0, 1).
+
+    Returns:
+        The change, a scalar.
+
+    Raises:
+        ValueError: if shapes disagree or ``gamma`` is outside [0, 1).
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_safe.objectives.functional import surrogate_change
+        >>> log_pi, advantage = torch.tensor([0.5, 0.5]).log(), torch.tensor([1.0, -1.0])
+        >>> log_prob = torch.tensor([0.6, 0.4]).log()  # the better action, more often
+        >>> surrogate_change(log_prob, log_pi, log_pi, advantage, gamma=0.9)
+        tensor(2.0000)
+    """
+    if not log_prob.shape == log_pi.shape == log_mu.shape == advantage.shape:
+        raise ValueError(
+            "log_prob, log_pi, log_mu and advantage must have the same shape, got "
+            f"{tuple(log_prob.shape)}, {tuple(log_pi.shape)}, {tuple(log_mu.shape)} and "
+            f"{tuple(advantage.shape)}."
+        )
+    if not 0 <= gamma < 1:
+        raise ValueError(f"gamma must be in [0, 1), got {gamma}.")
+    weight = (log_pi - log_mu).clamp(max=0).exp()
+    centred = advantage - (weight * advantage).mean() / weight.mean()
+    return (torch.expm1(log_prob - log_pi) * weight * centred).mean() / (1 - gamma)
 
 
 def moment_matched_kl(

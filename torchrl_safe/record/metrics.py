@@ -117,7 +117,7 @@ def proportion_interval(successes: int, trials: int) -> tuple[float, float]:
 
     Examples:
         >>> low, high = proportion_interval(0, 100)
-        >>> low, round(high, 3)
+        >>> round(low, 3), round(high, 3)
         (0.0, 0.037)
     """
     if trials < 1:

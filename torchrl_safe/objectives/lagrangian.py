@@ -1,0 +1,237 @@
+"""Lagrange multipliers: constraint, multiplier and Lagrangian as separate objects.
+
+A constraint is a number that is feasible at or below 0, as
+:meth:`~torchrl_safe.CVaRCostLoss.constraint` returns it. A multiplier prices it, and
+:func:`lagrangian` puts both into what a policy maximises.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+__all__ = ["LagrangeMultiplier", "PIDMultiplier", "lagrangian"]
+
+
+def lagrangian(objective: Tensor, constraint: Tensor, multiplier: Tensor) -> Tensor:
+    r"""Lagrangian of a constrained maximisation, rescaled.
+
+    .. math::
+
+        L = \frac{f - \sum_i \lambda_i c_i}{1 + \sum_i \lambda_i}
+
+    The denominator moves no optimum over the policy. It keeps the gradient, a convex combination
+    of those of objective and constraints, from growing with the multipliers (Stooke et al. 2020,
+    https://arxiv.org/abs/2007.03964, section 6).
+
+    Args:
+        objective (Tensor): ``f``, to be maximised, a scalar.
+        constraint (Tensor): ``c``, feasible at or below 0, ``[m]``.
+        multiplier (Tensor): ``lambda >= 0``, ``[m]``. No gradient flows to it.
+
+    Returns:
+        The Lagrangian, a scalar, to be maximised.
+
+    Raises:
+        ValueError: if shapes disagree.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_safe.objectives import lagrangian
+        >>> lagrangian(torch.tensor(4.0), torch.tensor([1.0]), torch.tensor([3.0]))
+        tensor(0.2500)
+    """
+    if objective.shape != () or constraint.ndim != 1 or constraint.shape != multiplier.shape:
+        raise ValueError(
+            "objective, constraint and multiplier must have shapes [], [m] and [m], got "
+            f"{tuple(objective.shape)}, {tuple(constraint.shape)} and {tuple(multiplier.shape)}."
+        )
+    multiplier = multiplier.detach()
+    return (objective - (multiplier * constraint).sum()) / (1 + multiplier.sum())
+
+
+class LagrangeMultiplier(nn.Module):
+    r"""Multipliers that gradient ascent on the dual function learns.
+
+    :math:`\lambda = \mathrm{softplus}(w)` is positive for every weight, so that any torch
+    optimizer may own the weights, with momentum and a state of its own. SAC-Lagrangian (Ha et al.
+    2020, https://arxiv.org/abs/2002.08550) and WCSAC (Yang et al. 2021) constrain like this.
+
+    Args:
+        num_constraints (int): m. Defaults to 1.
+
+    Keyword Args:
+        init (float): multipliers to start with, positive. Defaults to 1.0.
+
+    Raises:
+        ValueError: if ``num_constraints`` is not positive, or ``init`` is not positive and finite.
+
+    Examples:
+        A weight of 2 prices ``max -x^2`` to where ``x >= 1`` holds:
+
+        >>> import torch
+        >>> from torchrl_safe.objectives import LagrangeMultiplier, lagrangian
+        >>> x, multiplier = torch.zeros(1, requires_grad=True), LagrangeMultiplier()
+        >>> policy_optim = torch.optim.SGD([x], lr=0.1, maximize=True)
+        >>> multiplier_optim = torch.optim.Adam(multiplier.parameters(), lr=0.02)
+        >>> for _ in range(1000):
+        ...     constraint = 1 - x
+        ...     policy_optim.zero_grad()
+        ...     lagrangian(-x.square().sum(), constraint, multiplier()).backward()
+        ...     policy_optim.step()
+        ...     multiplier_optim.zero_grad()
+        ...     multiplier.loss(constraint).backward()
+        ...     multiplier_optim.step()
+        >>> round(x.item(), 2), round(multiplier().item(), 2)
+        (1.0, 2.0)
+    """
+
+    def __init__(self, num_constraints: int = 1, *, init: float = 1.0) -> None:
+        super().__init__()
+        _check_count(num_constraints)
+        if not 0 < init < math.inf:
+            raise ValueError(f"init must be positive and finite, got {init}.")
+        # The inverse of softplus, without overflow.
+        self.weight = nn.Parameter(
+            torch.full((num_constraints,), init + math.log(-math.expm1(-init)))
+        )
+
+    def forward(self) -> Tensor:
+        """The multipliers, ``[m]``."""
+        return F.softplus(self.weight)
+
+    def loss(self, constraint: Tensor) -> Tensor:
+        """What the multipliers' optimizer minimises: a violated constraint raises its price.
+
+        Args:
+            constraint (Tensor): ``[m]``, feasible at or below 0. No gradient flows to it.
+
+        Returns:
+            ``-lambda' c``, a scalar.
+
+        Raises:
+            ValueError: if ``constraint`` has another shape or is not finite.
+        """
+        return -(self() * _checked(constraint, self.weight)).sum()
+
+    def extra_repr(self) -> str:
+        """Describe the module in ``repr``."""
+        return f"num_constraints={len(self.weight)}"
+
+
+class PIDMultiplier(nn.Module):
+    r"""Multipliers set by a PID controller of the constraint.
+
+    Algorithm 2 of "Responsive safety in reinforcement learning by PID Lagrangian methods" (Stooke
+    et al. 2020, https://arxiv.org/abs/2007.03964), with the constraint as the error:
+
+    .. math::
+
+        I \leftarrow (I + c)_+, \qquad
+        \lambda \leftarrow \left(K_P c + K_I I + K_D (c - c_{prev})_+\right)_+
+
+    With ``ki`` alone it is gradient ascent on the multiplier, projected to ``lambda >= 0``; the
+    other two terms damp its oscillation. The state (integral, last constraint, multipliers) is in
+    ``state_dict``; nothing is learned by gradient.
+
+    Args:
+        num_constraints (int): m. Defaults to 1.
+
+    Keyword Args:
+        kp (float): proportional gain, at least 0.
+        ki (float): integral gain, at least 0.
+        kd (float): derivative gain, at least 0. Defaults to 0.
+        init (float): multipliers to start with, at least 0. They enter the integral, so a positive
+            ``init`` needs a positive ``ki``. Defaults to 0.
+
+    Raises:
+        ValueError: if an argument is out of its range, or all gains are 0.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_safe.objectives import PIDMultiplier
+        >>> multiplier = PIDMultiplier(kp=1.0, ki=0.1, kd=0.5)
+        >>> multiplier.update(torch.tensor([2.0]))  # 1 * 2 + .1 * 2
+        tensor([2.2000])
+        >>> multiplier.update(torch.tensor([3.0]))  # 1 * 3 + .1 * 5 + .5 * 1
+        tensor([4.])
+        >>> multiplier()
+        tensor([4.])
+    """
+
+    integral: Tensor
+    previous: Tensor
+    multiplier: Tensor
+
+    def __init__(
+        self,
+        num_constraints: int = 1,
+        *,
+        kp: float,
+        ki: float,
+        kd: float = 0.0,
+        init: float = 0.0,
+    ) -> None:
+        super().__init__()
+        _check_count(num_constraints)
+        for name, value in (("kp", kp), ("ki", ki), ("kd", kd), ("init", init)):
+            if not 0 <= value < math.inf:
+                raise ValueError(f"{name} must be at least 0 and finite, got {value}.")
+        if not kp + ki + kd > 0:
+            raise ValueError("one of kp, ki and kd must be positive, got 0 for all of them.")
+        if init > 0 and not ki > 0:
+            raise ValueError(f"init={init} needs a positive ki, got ki={ki}.")
+        self.kp, self.ki, self.kd = kp, ki, kd
+        self.register_buffer("integral", torch.full((num_constraints,), init / ki if ki else 0.0))
+        # NaN: there is no last constraint yet, and no derivative.
+        self.register_buffer("previous", torch.full((num_constraints,), torch.nan))
+        self.register_buffer("multiplier", torch.full((num_constraints,), float(init)))
+
+    def forward(self) -> Tensor:
+        """The multipliers, ``[m]``."""
+        return self.multiplier
+
+    def update(self, constraint: Tensor) -> Tensor:
+        """One step of the controller.
+
+        Args:
+            constraint (Tensor): ``[m]``, feasible at or below 0.
+
+        Returns:
+            The new multipliers, ``[m]``.
+
+        Raises:
+            ValueError: if ``constraint`` has another shape or is not finite; the state is then
+                left as it was.
+        """
+        error = _checked(constraint, self.multiplier)
+        rise = torch.where(self.previous.isnan(), 0.0, error - self.previous).clamp(min=0)
+        self.integral = (self.integral + error).clamp(min=0)
+        self.previous = error
+        self.multiplier = (self.kp * error + self.ki * self.integral + self.kd * rise).clamp(min=0)
+        return self.multiplier
+
+    def extra_repr(self) -> str:
+        """Describe the module in ``repr``."""
+        return f"num_constraints={len(self.multiplier)}, kp={self.kp}, ki={self.ki}, kd={self.kd}"
+
+
+def _check_count(num_constraints: int) -> None:
+    if num_constraints < 1:
+        raise ValueError(f"num_constraints must be at least 1, got {num_constraints}.")
+
+
+def _checked(constraint: Tensor | Sequence[float], like: Tensor) -> Tensor:
+    """A constraint without gradient, on the device and of the dtype of the multipliers."""
+    constraint = torch.as_tensor(constraint).detach().to(like)
+    if constraint.shape != like.shape:
+        raise ValueError(
+            f"constraint must have shape {tuple(like.shape)}, got {tuple(constraint.shape)}."
+        )
+    if not constraint.isfinite().all():
+        raise ValueError(f"constraint must be finite, got {constraint.tolist()}.")
+    return constraint

@@ -1,0 +1,567 @@
+"""Surrogates of return and CVaR cost out of ratios and advantages: CPO, TRC, off-policy TRC."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Literal, NamedTuple
+
+import torch
+from tensordict import TensorDict, TensorDictBase, TensorDictParams
+from tensordict.nn import TensorDictModule, dispatch
+from tensordict.utils import NestedKey
+from torch import Tensor
+from torchrl.objectives import LossModule, distance_loss
+from torchrl.objectives.value import ValueEstimatorBase
+
+from torchrl_safe.objectives.functional import check_risk_level, gaussian_cvar, surrogate_change
+from torchrl_safe.objectives.value import (
+    RetraceEstimator,
+    retrace_variance_reward,
+    squared_td_error,
+)
+
+
+class CostMoments(NamedTuple):
+    """Mean and variance of the discounted cost sum that a policy meets, scalars."""
+
+    mean: Tensor
+    variance: Tensor
+
+
+class _SurrogateLoss(LossModule):
+    """What both surrogates share: critics of states, Retrace on them, ratios."""
+
+    default_value_estimator = RetraceEstimator
+    loss_function: str
+
+    def make_value_estimator(
+        self,
+        value_type: type[ValueEstimatorBase] | None = None,
+        *,
+        gamma: float = 0.99,
+        lmbda: float = 0.97,
+    ) -> _SurrogateLoss:
+        """Set discount and trace decay of the advantage.
+
+        The estimator is Retrace on values of states. Where the policy took the actions itself,
+        that is generalised advantage estimation (https://arxiv.org/abs/1506.02438).
+
+        Args:
+            value_type (class, optional): :class:`~torchrl_safe.RetraceEstimator`, the default.
+
+        Keyword Args:
+            gamma (float): discount in [0, 1). Defaults to 0.99.
+            lmbda (float): trace decay in [0, 1]. Defaults to 0.97.
+
+        Returns:
+            The loss itself.
+
+        Raises:
+            NotImplementedError: for another estimator.
+            ValueError: if a coefficient is out of its range.
+        """
+        if value_type not in (None, RetraceEstimator):
+            raise NotImplementedError(
+                f"value_type must be RetraceEstimator or None, got {value_type}."
+            )
+        if not 0 <= gamma < 1:
+            raise ValueError(f"gamma must be in [0, 1), got {gamma}.")
+        self._make_estimators(gamma, lmbda)
+        return self
+
+    def _make_estimators(self, gamma: float, lmbda: float) -> None:
+        self._value_estimator = RetraceEstimator(gamma=gamma, lmbda=lmbda)
+        self.gamma = gamma
+
+    def _forward_value_estimator_keys(self, **kwargs: Any) -> None:
+        pass  # Data are handed to the estimators under their own keys.
+
+    def _value(self, name: str, key: NestedKey, tensordict: TensorDictBase) -> Tensor:
+        """A critic's prediction, [*B, 1]."""
+        network: TensorDictModule = getattr(self, name)
+        with getattr(self, f"{name}_params").to_module(network):
+            return network(tensordict.select(*network.in_keys)).get(key)
+
+    def _log_probs(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor]:
+        """Log-densities of the stored action under the policy and under its sampler, [*B]."""
+        log_mu = tensordict.get(self.tensor_keys.log_prob)
+        return tensordict.get(self.tensor_keys.policy_log_prob, log_mu), log_mu
+
+    def _advantage(
+        self,
+        estimator: ValueEstimatorBase,
+        tensordict: TensorDictBase,
+        reward: Tensor,
+        value: Tensor,
+        next_value: Tensor,
+    ) -> Tensor:
+        log_pi, log_mu = self._log_probs(tensordict)
+        data = TensorDict(
+            {
+                "policy_log_prob": log_pi,
+                "action_log_prob": log_mu,
+                "state_action_value": value,
+                "next": {
+                    "reward": reward,
+                    "state_value": next_value,
+                    "done": tensordict.get(("next", self.tensor_keys.done)),
+                    "terminated": self._terminated(tensordict),
+                },
+            },
+            tensordict.batch_size,
+        )
+        return estimator.value_estimate(data) - value
+
+    def _terminated(self, tensordict: TensorDictBase) -> Tensor:
+        done = tensordict.get(("next", self.tensor_keys.done))
+        return tensordict.get(("next", self.tensor_keys.terminated), done)
+
+    def _weight(self, tensordict: TensorDictBase) -> Tensor:
+        """``min(1, pi / mu)``, the share of a correction that a critic of states takes, [*B, 1]."""
+        log_pi, log_mu = self._log_probs(tensordict)
+        return (log_pi - log_mu).clamp(max=0).exp().unsqueeze(-1)
+
+    def _change(
+        self, tensordict: TensorDictBase, log_prob: Tensor, advantage: NestedKey, gamma: float
+    ) -> Tensor:
+        advantages = tensordict.get(advantage, None)
+        if advantages is None:
+            raise KeyError(
+                f"{advantage!r} is missing: pass what compute_advantage returned; the tensordict "
+                f"has {sorted(map(str, tensordict.keys(True)))}."
+            )
+        log_pi, log_mu = self._log_probs(tensordict)
+        return surrogate_change(log_prob, log_pi, log_mu, advantages.squeeze(-1), gamma)
+
+    def _regression(self, prediction: Tensor, target: Tensor, tensordict: TensorDictBase) -> Tensor:
+        loss = distance_loss(prediction, target, self.loss_function).squeeze(-1)
+        return self._reduce_loss(loss, tensordict=tensordict, weights=None)
+
+
+class ReturnSurrogateLoss(_SurrogateLoss):
+    r"""Surrogate of the return, and the critic behind it.
+
+    The objective of TRPO, CPO and TRC: how much the discounted return changes from the policy
+    ``pi`` that advantages belong to, to one whose log-densities are given, see
+    :func:`~torchrl_safe.objectives.functional.surrogate_change`.
+
+    :meth:`compute_advantage` runs once on trajectories; the critic regresses on minibatches of
+    its result (:meth:`forward`), and :meth:`objective` is an entry of a closure for
+    :class:`~torchrl_safe.TrustRegionSafeOptimizer`.
+
+    Args:
+        value_network (TensorDictModule): writes ``"state_value"``, ``[*B, 1]``.
+
+    Keyword Args:
+        loss_function (str): ``"l2"``, ``"smooth_l1"`` or ``"l1"``. Defaults to ``"l2"``.
+        reduction (str): ``"mean"``, ``"sum"`` or ``"none"``. Defaults to ``"mean"``.
+
+    .. note::
+        Data of the policy itself need ``"action_log_prob"``. Data of older policies also need
+        ``"policy_log_prob"``, the log-density of the stored action under the policy of now:
+        advantages are then corrected as in Retrace.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl.modules import MLP, ValueOperator
+        >>> from torchrl_safe.objectives import ReturnSurrogateLoss
+        >>> loss = ReturnSurrogateLoss(ValueOperator(MLP(3, 1, num_cells=[8])))
+        >>> _ = loss.make_value_estimator(gamma=0.99, lmbda=0.97)
+        >>> data = TensorDict(
+        ...     {
+        ...         "observation": torch.randn(4, 10, 3),
+        ...         "action_log_prob": torch.zeros(4, 10),
+        ...         "next": {
+        ...             "observation": torch.randn(4, 10, 3),
+        ...             "reward": torch.rand(4, 10, 1),
+        ...             "done": torch.zeros(4, 10, 1, dtype=torch.bool),
+        ...         },
+        ...     },
+        ...     batch_size=[4, 10],
+        ... )
+        >>> data = loss.compute_advantage(data)
+        >>> loss(data)["loss_value"].backward()
+        >>> loss.objective(data, data["action_log_prob"])  # no change of policy, no change
+        tensor(0.)
+    """
+
+    @dataclass
+    class _AcceptedKeys:
+        """Default values of all configurable tensordict keys.
+
+        Attributes:
+            log_prob (NestedKey): Log-density of the action under the policy that took it.
+                Defaults to ``"action_log_prob"``.
+            policy_log_prob (NestedKey): Under the current policy, if that is another one.
+                Defaults to ``"policy_log_prob"``.
+            reward (NestedKey): Under ``"next"``. Defaults to ``"reward"``.
+            value (NestedKey): Output of the critic. Defaults to ``"state_value"``.
+            advantage (NestedKey): Defaults to ``"advantage"``.
+            value_target (NestedKey): Defaults to ``"value_target"``.
+            done (NestedKey): Under ``"next"``: cuts the trace. Defaults to ``"done"``.
+            terminated (NestedKey): Under ``"next"``: no reward follows. Defaults to
+                ``"terminated"``.
+        """
+
+        log_prob: NestedKey = "action_log_prob"
+        policy_log_prob: NestedKey = "policy_log_prob"
+        reward: NestedKey = "reward"
+        value: NestedKey = "state_value"
+        advantage: NestedKey = "advantage"
+        value_target: NestedKey = "value_target"
+        done: NestedKey = "done"
+        terminated: NestedKey = "terminated"
+
+    default_keys = _AcceptedKeys
+    tensor_keys: _AcceptedKeys
+
+    value_network: TensorDictModule
+    value_network_params: TensorDictParams
+    target_value_network_params: TensorDictParams
+
+    def __init__(
+        self,
+        value_network: TensorDictModule,
+        *,
+        loss_function: str = "l2",
+        reduction: Literal["mean", "sum", "none"] = "mean",
+    ) -> None:
+        super().__init__()
+        self.convert_to_functional(value_network, "value_network", create_target_params=False)
+        self.loss_function = loss_function
+        self.reduction = reduction
+        self.in_keys = [*value_network.in_keys, self.tensor_keys.value_target]
+        self.out_keys = ["loss_value"]
+        self.make_value_estimator()
+
+    @torch.no_grad()
+    def compute_advantage(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Advantages and the critic's targets.
+
+        Args:
+            tensordict (TensorDictBase): trajectories ``[*B, T]``.
+
+        Returns:
+            A shallow copy with ``"advantage"`` and ``"value_target"``, ``[*B, T, 1]``.
+        """
+        keys = self.tensor_keys
+        value, next_value = (
+            self._value("value_network", keys.value, states)
+            for states in (tensordict, tensordict.get("next"))
+        )
+        reward = tensordict.get(("next", keys.reward))
+        advantage = self._advantage(self._value_estimator, tensordict, reward, value, next_value)
+        out = tensordict.copy()
+        out.set(keys.advantage, advantage)
+        out.set(keys.value_target, value + self._weight(tensordict) * advantage)
+        return out
+
+    @dispatch
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Loss of the critic.
+
+        Args:
+            tensordict (TensorDictBase): states with their ``"value_target"``, ``[*B]``.
+
+        Returns:
+            TensorDict of ``loss_value``.
+        """
+        keys = self.tensor_keys
+        value = self._value("value_network", keys.value, tensordict)
+        loss = self._regression(value, tensordict.get(keys.value_target), tensordict)
+        return TensorDict({"loss_value": loss}, loss.shape)
+
+    def objective(self, tensordict: TensorDictBase, log_prob: Tensor) -> Tensor:
+        """Change of the discounted return, 0 at the policy that the advantages belong to.
+
+        Args:
+            tensordict (TensorDictBase): what :meth:`compute_advantage` returned, or some of it,
+                ``[*B]``.
+            log_prob (Tensor): log-density of the stored actions under the new policy, ``[*B]``.
+
+        Returns:
+            The change, a scalar, in units of the discounted return.
+
+        Raises:
+            KeyError: if there is no advantage in the data.
+        """
+        return self._change(tensordict, log_prob, self.tensor_keys.advantage, self.gamma)
+
+
+class CVaRSurrogateLoss(_SurrogateLoss):
+    r"""Surrogate of the CVaR of the discounted cost, and the critics behind it.
+
+    The constraint of TRC (Kim and Oh, "TRC: Trust Region Conditional Value at Risk for Safe
+    Reinforcement Learning", RA-L 2022), and at ``risk_level=1`` that of CPO (Achiam et al. 2017,
+    https://arxiv.org/abs/1705.10528). With ``J_C`` and ``J_S`` the first two moments of the
+    discounted cost sum,
+
+    .. math::
+
+        \Gamma(\pi') = J_C(\pi') + \frac{\phi(\Phi^{-1}(\alpha))}{\alpha}
+            \sqrt{J_S(\pi') - J_C(\pi')^2} \le d
+
+    and both moments follow a new policy by their surrogates,
+    :func:`~torchrl_safe.objectives.functional.surrogate_change`, at discounts ``gamma`` and
+    ``gamma ** 2``.
+
+    **Units.** The cost is per step. Moments, ``Gamma`` and ``cost_limit`` are those of its
+    *discounted sum*: a limit of ``c`` on the cost per step is ``cost_limit = c / (1 - gamma)``,
+    a budget ``D`` per episode of ``T`` steps ``D / T / (1 - gamma)``, see
+    :func:`~torchrl_safe.objectives.functional.discounted_cost_limit`. The gradient is in the same
+    unit, so that the trust region sees how far a violation can be repaired.
+
+    **Start.** Episodes start where the policy is: the moments are over the states that it visits,
+    each counted once. Over those, ``J_C`` is the mean cost per step over ``1 - gamma``, which data
+    measure without a critic.
+
+    Args:
+        cost_network (TensorDictModule): writes ``"cost_value"``, ``[*B, 1]``.
+        variance_network (TensorDictModule): writes ``"cost_variance"``, ``[*B, 1]``,
+            non-negative: end it with a softplus.
+
+    Keyword Args:
+        cost_limit (float): limit on the discounted cost sum, at least 0.
+        risk_level (float): share of worst outcomes that the CVaR averages, in (0, 1]; 1 is the
+            plain expectation. Defaults to 0.125.
+        loss_function (str): ``"l2"``, ``"smooth_l1"`` or ``"l1"``. Defaults to ``"l2"``.
+        reduction (str): ``"mean"``, ``"sum"`` or ``"none"``. Defaults to ``"mean"``.
+
+    .. note::
+        For several costs, make a loss for each, such as ``loss.set_keys(cost="collision_cost")``.
+        Each keeps the copy of the data that its own :meth:`compute_advantage` returned, and their
+        constraints are stacked.
+
+    Raises:
+        ValueError: if ``cost_limit`` is negative or not finite, or ``risk_level`` is outside
+            (0, 1].
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl.modules import MLP, ValueOperator
+        >>> from torchrl_safe.objectives import CVaRSurrogateLoss
+        >>> loss = CVaRSurrogateLoss(
+        ...     ValueOperator(MLP(3, 1, num_cells=[8]), out_keys=["cost_value"]),
+        ...     ValueOperator(
+        ...         MLP(3, 1, num_cells=[8]).append(torch.nn.Softplus()), out_keys=["cost_variance"]
+        ...     ),
+        ...     cost_limit=2.5,
+        ... )
+        >>> _ = loss.make_value_estimator(gamma=0.99, lmbda=0.97)
+        >>> data = TensorDict(
+        ...     {
+        ...         "observation": torch.randn(4, 10, 3),
+        ...         "action_log_prob": torch.zeros(4, 10),
+        ...         "next": {
+        ...             "observation": torch.randn(4, 10, 3),
+        ...             "cost": torch.rand(4, 10, 1),
+        ...             "done": torch.zeros(4, 10, 1, dtype=torch.bool),
+        ...         },
+        ...     },
+        ...     batch_size=[4, 10],
+        ... )
+        >>> data = loss.compute_advantage(data)
+        >>> sorted(loss(data).keys())
+        ['loss_cost_value', 'loss_cost_variance']
+        >>> moments = loss.on_policy_moments(data)
+        >>> log_prob = torch.zeros(4, 10, requires_grad=True)  # of the policy to be improved
+        >>> loss.constraint(data, log_prob, moments).backward()  # Gamma - cost_limit
+    """
+
+    @dataclass
+    class _AcceptedKeys:
+        """Default values of all configurable tensordict keys.
+
+        Attributes:
+            log_prob (NestedKey): Log-density of the action under the policy that took it.
+                Defaults to ``"action_log_prob"``.
+            policy_log_prob (NestedKey): Under the current policy, if that is another one.
+                Defaults to ``"policy_log_prob"``.
+            cost (NestedKey): Cost of a step, under ``"next"``. Defaults to ``"cost"``.
+            cost_value (NestedKey): Output of the critic of the mean. Defaults to ``"cost_value"``.
+            cost_variance (NestedKey): Output of the critic of the variance.
+                Defaults to ``"cost_variance"``.
+            cost_advantage (NestedKey): Advantage of the mean. Defaults to ``"cost_advantage"``.
+            square_advantage (NestedKey): Advantage of the second moment.
+                Defaults to ``"square_advantage"``.
+            cost_target (NestedKey): Defaults to ``"cost_target"``.
+            variance_target (NestedKey): Defaults to ``"variance_target"``.
+            done (NestedKey): Under ``"next"``: cuts the trace. Defaults to ``"done"``.
+            terminated (NestedKey): Under ``"next"``: no cost follows. Defaults to ``"terminated"``.
+        """
+
+        log_prob: NestedKey = "action_log_prob"
+        policy_log_prob: NestedKey = "policy_log_prob"
+        cost: NestedKey = "cost"
+        cost_value: NestedKey = "cost_value"
+        cost_variance: NestedKey = "cost_variance"
+        cost_advantage: NestedKey = "cost_advantage"
+        square_advantage: NestedKey = "square_advantage"
+        cost_target: NestedKey = "cost_target"
+        variance_target: NestedKey = "variance_target"
+        done: NestedKey = "done"
+        terminated: NestedKey = "terminated"
+
+    default_keys = _AcceptedKeys
+    tensor_keys: _AcceptedKeys
+
+    cost_network: TensorDictModule
+    variance_network: TensorDictModule
+    cost_network_params: TensorDictParams
+    variance_network_params: TensorDictParams
+    target_cost_network_params: TensorDictParams
+    target_variance_network_params: TensorDictParams
+
+    def __init__(
+        self,
+        cost_network: TensorDictModule,
+        variance_network: TensorDictModule,
+        *,
+        cost_limit: float,
+        risk_level: float = 0.125,
+        loss_function: str = "l2",
+        reduction: Literal["mean", "sum", "none"] = "mean",
+    ) -> None:
+        check_risk_level(risk_level)
+        if not 0 <= cost_limit < float("inf"):
+            raise ValueError(f"cost_limit must be finite and at least 0, got {cost_limit}.")
+        super().__init__()
+        for name, network in (
+            ("cost_network", cost_network),
+            ("variance_network", variance_network),
+        ):
+            self.convert_to_functional(network, name, create_target_params=False)
+        self.cost_limit = float(cost_limit)
+        self.risk_level = risk_level
+        self.loss_function = loss_function
+        self.reduction = reduction
+        keys = self.tensor_keys
+        self.in_keys = [
+            *dict.fromkeys([*cost_network.in_keys, *variance_network.in_keys]),
+            keys.cost_target,
+            keys.variance_target,
+        ]
+        self.out_keys = ["loss_cost_value", "loss_cost_variance"]
+        self.make_value_estimator()
+
+    def _make_estimators(self, gamma: float, lmbda: float) -> None:
+        super()._make_estimators(gamma, lmbda)
+        self._square_estimator = RetraceEstimator(gamma=gamma**2, lmbda=lmbda)
+
+    @torch.no_grad()
+    def compute_advantage(self, tensordict: TensorDictBase) -> TensorDictBase:
+        r"""Advantages of both moments and the critics' targets.
+
+        The variance :math:`V` obeys the recursion of the mean at discount ``gamma ** 2`` with the
+        squared TD error for a reward. The second moment :math:`V_C^2 + V` is what it is
+        compared with at the stored action, :math:`(c + \gamma V_C')^2 + \gamma^2 V'`.
+
+        Args:
+            tensordict (TensorDictBase): trajectories ``[*B, T]``.
+
+        Returns:
+            A shallow copy with ``"cost_advantage"``, ``"square_advantage"``, ``"cost_target"`` and
+            ``"variance_target"``, ``[*B, T, 1]``.
+        """
+        keys = self.tensor_keys
+        mean, next_mean = (
+            self._value("cost_network", keys.cost_value, states)
+            for states in (tensordict, tensordict.get("next"))
+        )
+        variance, next_variance = (
+            self._value("variance_network", keys.cost_variance, states)
+            for states in (tensordict, tensordict.get("next"))
+        )
+        cost = tensordict.get(("next", keys.cost))
+        advantage = self._advantage(self._value_estimator, tensordict, cost, mean, next_mean)
+
+        def second_order(reward: Callable[..., Tensor]) -> Tensor:
+            terminated = self._terminated(tensordict)
+            rewards = reward(self.gamma, cost, mean, next_mean, terminated)
+            return self._advantage(
+                self._square_estimator, tensordict, rewards, variance, next_variance
+            )
+
+        weight = self._weight(tensordict)
+        out = tensordict.copy()
+        out.set(keys.cost_advantage, advantage)
+        out.set(keys.square_advantage, second_order(retrace_variance_reward))
+        out.set(keys.cost_target, mean + weight * advantage)
+        # Trace corrections can make a sampled target of a variance negative.
+        target = variance + weight * second_order(squared_td_error)
+        out.set(keys.variance_target, target.clamp(min=0))
+        return out
+
+    @dispatch
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Losses of the two critics.
+
+        Args:
+            tensordict (TensorDictBase): states with their targets, ``[*B]``.
+
+        Returns:
+            TensorDict of ``loss_cost_value`` and ``loss_cost_variance``.
+        """
+        keys = self.tensor_keys
+        mean = self._value("cost_network", keys.cost_value, tensordict)
+        variance = self._value("variance_network", keys.cost_variance, tensordict)
+        losses = {
+            "loss_cost_value": self._regression(mean, tensordict.get(keys.cost_target), tensordict),
+            "loss_cost_variance": self._regression(
+                variance, tensordict.get(keys.variance_target), tensordict
+            ),
+        }
+        return TensorDict(losses, losses["loss_cost_value"].shape)
+
+    @torch.no_grad()
+    def on_policy_moments(self, tensordict: TensorDictBase) -> CostMoments:
+        r"""Moments of the discounted cost of the policy that took the given steps.
+
+        The mean is measured: mean cost per step over ``1 - gamma``. The variance is the critics',
+        :math:`E[V] + Var[V_C]` over the visited states.
+
+        Args:
+            tensordict (TensorDictBase): steps of the current policy, ``[*B]``.
+
+        Returns:
+            CostMoments: in units of the discounted cost sum, and in squared units.
+        """
+        keys = self.tensor_keys
+        mean = self._value("cost_network", keys.cost_value, tensordict)
+        variance = self._value("variance_network", keys.cost_variance, tensordict)
+        return CostMoments(
+            tensordict.get(("next", keys.cost)).mean() / (1 - self.gamma),
+            variance.mean() + mean.var(correction=0),
+        )
+
+    def constraint(
+        self, tensordict: TensorDictBase, log_prob: Tensor, moments: CostMoments
+    ) -> Tensor:
+        """The constraint, ``Gamma - cost_limit``, feasible at or below 0.
+
+        Args:
+            tensordict (TensorDictBase): what :meth:`compute_advantage` returned, or some of it,
+                ``[*B]``.
+            log_prob (Tensor): log-density of the stored actions under the new policy, ``[*B]``.
+            moments (CostMoments): of the policy that the advantages belong to, from
+                :meth:`on_policy_moments`.
+
+        Returns:
+            The constraint, a scalar, in units of the discounted cost sum.
+
+        Raises:
+            KeyError: if there are no advantages in the data.
+        """
+        keys = self.tensor_keys
+        change = self._change(tensordict, log_prob, keys.cost_advantage, self.gamma)
+        mean = moments.mean + change
+        if self.risk_level == 1:
+            return mean - self.cost_limit
+        square_change = self._change(tensordict, log_prob, keys.square_advantage, self.gamma**2)
+        variance = moments.variance + square_change - (mean.square() - moments.mean.square())
+        # The root has no slope at 0; a variance this small has no part in a CVaR.
+        std = variance.clamp(min=1e-8).sqrt()
+        return gaussian_cvar(mean, std, self.risk_level) - self.cost_limit

@@ -124,6 +124,7 @@ RULES: dict[str, Rule] = {
     "optim.updates_per_frame": number("(0, inf)"),
     "optim.critic_lr": number("(0, inf)"),
     "optim.max_grad_norm": number("(0, inf)"),
+    "optim.max_skipped": integer(0),
     "optim.critic_rounds": integer(1),
     "optim.critic_frames": integer(1),
     "optim.minibatch_size": integer(1),

@@ -119,7 +119,7 @@ class TestVector:
     @staticmethod
     def make(robot, mode, options) -> GymGoalVectorEnv:
         return gymnasium.make_vec(
-            f"torchrl_safe/{robot.capitalize()}Goal-v0",
+            f"torchrl_safe/{robot.title().replace('_', '')}Goal-v0",
             num_envs=4,
             num_threads=1,
             episode_length=LENGTH,

@@ -16,7 +16,7 @@ POINT = "torchrl_safe/PointGoal-v0"
 
 
 def identifier(robot: str) -> str:
-    return f"torchrl_safe/{robot.capitalize()}Goal-v0"
+    return f"torchrl_safe/{robot.title().replace('_', '')}Goal-v0"
 
 
 def make_vec(num_envs: int = 3, **options) -> GymGoalVectorEnv:
@@ -37,6 +37,11 @@ class TestRegistration:
         assert isinstance(envs, GymGoalVectorEnv)
         observations, _ = envs.reset(seed=0)
         assert observations in envs.observation_space
+
+    def test_ids(self):
+        robots = ("Point", "Car", "DoggoTorques", "Jackal")
+        registered = {name for name in gymnasium.registry if name.startswith("torchrl_safe/")}
+        assert registered == {f"torchrl_safe/{robot}Goal-v0" for robot in robots}
 
     def test_without_an_import(self):
         env = gymnasium.make(f"torchrl_safe.envs:{POINT}")

@@ -84,7 +84,7 @@ class TestScene:
         env.close()
 
     def test_gymnasium(self, robot, opengl):
-        name = f"torchrl_safe/{robot.capitalize()}Goal-v0"
+        name = f"torchrl_safe/{robot.title().replace('_', '')}Goal-v0"
         env = gymnasium.make(name, render_mode="rgb_array", width=64, height=48)
         env.reset(seed=0)
         env_render_passive_checker(env.unwrapped)  # warns, which is an error here

@@ -1,4 +1,4 @@
-"""Car and Doggo: their motion, what they sense, and Doggo's controller."""
+"""Car and Doggo: their motion and what they sense."""
 
 from __future__ import annotations
 

@@ -373,10 +373,13 @@ class GymGoalVectorEnv(gymnasium.vector.VectorEnv[NDArray[Any], NDArray[Any], ND
 
 
 def register_envs() -> None:
-    """Registers an id for each robot with Gymnasium: ``torchrl_safe/<Robot>Goal-v0``."""
+    """Registers an id for each robot with Gymnasium: ``torchrl_safe/<Robot>Goal-v0``.
+
+    The robot's name in camel case: ``torchrl_safe/DoggoTorquesGoal-v0`` is ``"doggo_torques"``.
+    """
     for name in ROBOTS:
         gymnasium.register(
-            f"torchrl_safe/{name.capitalize()}Goal-v0",
+            f"torchrl_safe/{name.title().replace('_', '')}Goal-v0",
             entry_point="torchrl_safe.envs.gymnasium:GymGoalEnv",
             vector_entry_point="torchrl_safe.envs.gymnasium:GymGoalVectorEnv",
             kwargs={"robot": name},

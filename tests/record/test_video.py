@@ -216,7 +216,8 @@ def test_grid(tmp_path):
         height=48,
         index=[0, 1, 2],
     )
-    frames = [frame.astype(int) for frame in imageio.get_reader(path)]
+    with imageio.get_reader(path) as reader:
+        frames = [frame.astype(int) for frame in reader]
     assert len(frames) == 5
     assert frames[0].shape == (96, 128, 3)
     for time, frame in enumerate(frames):

@@ -10,7 +10,8 @@ import pytest
 import torch
 from critics import make_losses
 from omegaconf import OmegaConf
-from safetac_point import policy_closure, policy_kl
+from policy_steps import policy_kl
+from safetac_point import policy_closure
 from tensordict import TensorDict
 from torch import Tensor
 from utils import make_policy

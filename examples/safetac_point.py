@@ -13,20 +13,21 @@ from collections.abc import Callable
 
 import hydra
 import torch
-from critics import REPLAYED, fit_critics, make_buffer, make_critic_optim, make_losses
+from critics import (
+    REPLAYED,
+    fit_critics,
+    make_buffer,
+    make_critic_optim,
+    make_losses,
+    minibatches,
+)
 from omegaconf import DictConfig
+from policy_steps import Multiplier, ascend, cost_limit_at, make_trust_region
 from tensordict import TensorDict, TensorDictBase
 from torchrl._utils import timeit
 from utils import EVAL_SEED, Run, make_env, make_policy, set_up, train
 
-from torchrl_safe import (
-    CVaRCostLoss,
-    GMMTanhPolicy,
-    TanhGaussianMixture,
-    TrustRegionSafeOptimizer,
-    TsallisLoss,
-)
-from torchrl_safe.objectives.functional import moment_matched_kl
+from torchrl_safe import CVaRCostLoss, GMMTanhPolicy, TanhGaussianMixture, TsallisLoss
 
 
 def policy_closure(
@@ -34,12 +35,13 @@ def policy_closure(
     reward_loss: TsallisLoss,
     cost_loss: CVaRCostLoss,
     states: TensorDictBase,
-    level: torch.Tensor,
+    level: torch.Tensor | None = None,
     curvature_frames: int | None = None,
 ) -> Callable[[], TensorDict]:
     """Objective, constraint and policy moments of (13) as a function of the policy's weights.
 
-    ``level`` is the CVaR that the policy of now is known to have; the critics say how it changes.
+    ``level`` is the CVaR that the policy of now is known to have; the critics say how a change
+    that is kept will move it. Without, the constraint is (8) as written, in the objective's scale.
     The noise of the actions is drawn here, once: the line search then compares policies, not draws.
     Curvature is that of the first ``curvature_frames`` states, all of them by default.
     """
@@ -51,7 +53,9 @@ def policy_closure(
     with torch.no_grad():
         dist = policy.get_dist(states)
         noise = dist.draw_noise()
-        reference = cost_loss.cvar(states, dist.rsample(noise=noise)).mean()
+        reference = None
+        if level is not None:
+            reference = cost_loss.cvar(states, dist.rsample(noise=noise)).mean()
 
     def closure() -> TensorDict:
         dist = policy.get_dist(states)
@@ -70,31 +74,6 @@ def policy_closure(
     return closure
 
 
-def policy_kl(old: TensorDictBase, new: TensorDictBase) -> torch.Tensor:
-    """The trust region's distance (15), averaged over states."""
-    return moment_matched_kl(old["mean"], old["cov"], new["mean"], new["cov"]).mean()
-
-
-def cost_limit_at(cfg: DictConfig, frames: int) -> float:
-    """The limit of now: it falls, so that the agent learns to drive before it has to avoid."""
-    remaining = max(0.0, 1.0 - frames / max(1, cfg.loss.anneal_frames))
-    return cfg.loss.cost_limit + remaining * (cfg.loss.initial_cost_limit - cfg.loss.cost_limit)
-
-
-def make_trust_region(cfg: DictConfig, policy: GMMTanhPolicy) -> TrustRegionSafeOptimizer:
-    """The optimizer of the policy, with the options of the configuration."""
-    return TrustRegionSafeOptimizer(
-        policy.parameters(),
-        max_kl=cfg.optim.max_kl,
-        damping=cfg.optim.damping,
-        cg_iters=cfg.optim.cg_iters,
-        backtrack_ratio=cfg.optim.backtrack_ratio,
-        max_backtracks=cfg.optim.max_backtracks,
-        recovery_ratio=cfg.optim.recovery_ratio,
-        statistics_kl=policy_kl,
-    )
-
-
 @hydra.main(config_path=".", config_name="safetac_point", version_base="1.3")
 def main(cfg: DictConfig) -> None:
     """Train, evaluate and film an agent."""
@@ -105,8 +84,13 @@ def main(cfg: DictConfig) -> None:
     policy = make_policy(cfg, eval_env)
     reward_loss, cost_loss = make_losses(cfg, eval_env, policy)
     critic_optim = make_critic_optim(cfg, reward_loss, cost_loss)
-    policy_optim = make_trust_region(cfg, policy)
     buffer = make_buffer(cfg)
+    components = {}
+    if cfg.update == "trust_region":
+        policy_optim = make_trust_region(cfg, policy)
+    else:  # (9), the ablation
+        policy_optim = torch.optim.Adam(policy.parameters(), lr=cfg.lagrangian.policy_lr)
+        components["multiplier"] = multiplier = Multiplier(cfg, cfg.update)
     run = Run(
         cfg,
         reward_loss=reward_loss,
@@ -114,28 +98,32 @@ def main(cfg: DictConfig) -> None:
         critic_optim=critic_optim,
         policy_optim=policy_optim,
         buffer=buffer,
+        **components,
     )
 
     def update(batch: TensorDictBase) -> dict[str, float]:
-        """Algorithm 1: critics on replayed slices, then a trust-region step on the new states."""
+        """Algorithm 1: critics on replayed slices, then the policy on the new states."""
         buffer.extend(batch.select(*REPLAYED))
         if run.frames < cfg.collector.init_frames:
             return {}
         limit = cost_limit_at(cfg, run.frames)
         cost_loss.cost_limit.fill_(limit)
-        losses = fit_critics(cfg, buffer, reward_loss, cost_loss, critic_optim)
+        metrics = fit_critics(cfg, buffer, reward_loss, cost_loss, critic_optim)
         with timeit("time/policy"):
             visited = batch.select("observation").flatten()
-            states = visited[torch.randperm(len(visited))[: cfg.optim.policy_frames]]
             level = cost_loss.on_policy_cvar(batch)
-            report = policy_optim.step(
-                policy_closure(
+            if cfg.update == "trust_region":
+                states = visited[torch.randperm(len(visited))[: cfg.optim.policy_frames]]
+                closure = policy_closure(
                     policy, reward_loss, cost_loss, states, level, cfg.optim.curvature_frames
                 )
-            )
-        metrics = {**report.to_dict(), **losses, "update/cost_limit": limit}
-        metrics["update/constraint"] += limit
-        return metrics
+                metrics |= policy_optim.step(closure).to_dict()
+            else:
+                multiplier.update((level - limit)[None])
+                for states in minibatches(visited, cfg.lagrangian.minibatch_size):
+                    closure = policy_closure(policy, reward_loss, cost_loss, states)
+                    metrics |= ascend(policy_optim, closure, multiplier())
+        return {**metrics, "update/constraint": level.item(), "update/cost_limit": limit}
 
     train(run, policy, update, eval_env)
 

@@ -84,16 +84,20 @@ def make_policy(cfg: DictConfig, env: EnvBase) -> GMMTanhPolicy:
     )
 
 
-def make_critic(cfg: DictConfig, env: EnvBase, out_key: str, *last: nn.Module) -> ValueOperator:
-    """A critic of observation and action; ``last`` is put behind its linear output."""
+def make_critic(
+    cfg: DictConfig, env: EnvBase, out_key: str, *last: nn.Module, of_actions: bool = True
+) -> ValueOperator:
+    """A critic of observation and, by default, action; ``last`` goes behind its linear output."""
+    specs = {"observation": env.observation_spec["observation"], "action": env.action_spec}
+    in_keys = ["observation", "action"] if of_actions else ["observation"]
     network = MLP(
-        env.observation_spec["observation"].shape[-1] + env.action_spec.shape[-1],
+        sum(specs[key].shape[-1] for key in in_keys),
         1,
         num_cells=list(cfg.critic.num_cells),
         activation_class=nn.ReLU,
     )
     network.extend(last)
-    return ValueOperator(network, in_keys=["observation", "action"], out_keys=[out_key])
+    return ValueOperator(network, in_keys=in_keys, out_keys=[out_key])
 
 
 def train(

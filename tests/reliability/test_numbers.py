@@ -8,6 +8,7 @@ from pathlib import Path
 
 import critics
 import hydra
+import policy_steps
 import pytest
 import safetac_point
 import torch
@@ -41,7 +42,7 @@ class Update:
         self.policy = utils.make_policy(self.cfg, env)
         self.losses = critics.make_losses(self.cfg, env, self.policy)
         self.critic_optim = critics.make_critic_optim(self.cfg, *self.losses)
-        self.policy_optim = safetac_point.make_trust_region(self.cfg, self.policy)
+        self.policy_optim = policy_steps.make_trust_region(self.cfg, self.policy)
         self.batch = env.rollout(50, self.policy, break_when_any_done=False)
         self.batch["collector", "traj_ids"] = torch.arange(4)[:, None].expand(4, 50).clone()
         self.fit(self.batch)  # Adam has moments to lose

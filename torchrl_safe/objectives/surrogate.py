@@ -434,7 +434,7 @@ class CVaRSurrogateLoss(_SurrogateLoss):
             ("variance_network", variance_network),
         ):
             self.convert_to_functional(network, name, create_target_params=False)
-        self.cost_limit = float(cost_limit)
+        self.register_coeff_buffer("cost_limit", float(cost_limit), device=self._default_device)
         self.risk_level = risk_level
         self.loss_function = loss_function
         self.reduction = reduction

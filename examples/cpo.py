@@ -1,0 +1,22 @@
+"""CPO: constrained policy optimization (Achiam et al. 2017), which is TRC at ``risk_level=1``.
+
+    python examples/cpo.py                          # train, evaluate, film
+
+The algorithm is in trc.py; every option is in cpo.yaml, trc.yaml and base.yaml beside this file.
+"""
+
+from __future__ import annotations
+
+import hydra
+from omegaconf import DictConfig
+from trc import run_trc
+
+
+@hydra.main(config_path=".", config_name="cpo", version_base="1.3")
+def main(cfg: DictConfig) -> None:
+    """CPO as configured in cpo.yaml."""
+    run_trc(cfg)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,65 @@
+"""Off-policy TRC (Kim and Oh 2022): TRC's surrogates on replayed trajectories, by Retrace.
+
+    python examples/offpolicy_trc.py                # train, evaluate, film
+
+Every option is in offpolicy_trc.yaml, trc.yaml and base.yaml beside this file.
+"""
+
+from __future__ import annotations
+
+import hydra
+import torch
+from critics import REPLAYED, make_buffer
+from omegaconf import DictConfig
+from policy_steps import cost_limit_at, make_trust_region
+from surrogates import fit_critics, make_surrogates, policy_step, with_advantages
+from tensordict import TensorDictBase
+from torchrl._utils import timeit
+from utils import EVAL_SEED, Run, make_env, make_policy, set_up, train
+
+
+@hydra.main(config_path=".", config_name="offpolicy_trc", version_base="1.3")
+def main(cfg: DictConfig) -> None:
+    """Train, evaluate and film an agent."""
+    set_up(cfg)
+    eval_env = make_env(cfg, cfg.eval.num_episodes, EVAL_SEED)
+    policy = make_policy(cfg, eval_env)
+    reward_loss, cost_loss, critic_optim = make_surrogates(cfg, eval_env)
+    policy_optim = make_trust_region(cfg, policy)
+    buffer = make_buffer(cfg)
+    run = Run(
+        cfg,
+        reward_loss=reward_loss,
+        cost_loss=cost_loss,
+        critic_optim=critic_optim,
+        policy_optim=policy_optim,
+        buffer=buffer,
+    )
+
+    def replay(num_frames: int) -> TensorDictBase:
+        """Slices [B, T], with the density of their actions under the policy of now."""
+        data = buffer.sample(num_frames).reshape(-1, cfg.replay_buffer.slice_len)
+        with torch.no_grad():
+            log_prob = policy.get_dist(data).log_prob(data["action"])
+        return data.set("policy_log_prob", log_prob)
+
+    def update(batch: TensorDictBase) -> dict[str, float]:
+        """Critics, then a trust-region step, on old and new data; the level is of the new."""
+        buffer.extend(batch.select(*REPLAYED))
+        if run.frames < cfg.collector.init_frames:
+            return {}
+        cost_loss.cost_limit.fill_(cost_limit_at(cfg, run.frames))
+        with timeit("time/critics"):
+            for _ in range(cfg.optim.critic_rounds):
+                data = with_advantages(replay(cfg.optim.critic_frames), reward_loss, cost_loss)
+                losses = fit_critics(cfg, data, reward_loss, cost_loss, critic_optim)
+        with timeit("time/policy"):
+            data = with_advantages(replay(cfg.optim.policy_frames), reward_loss, cost_loss)
+            step = policy_step(policy, policy_optim, reward_loss, cost_loss, data, batch)
+        return {**losses, **step}
+
+    train(run, policy, update, eval_env)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,91 @@
+"""Two ways to move a policy under a constraint: inside a trust region, or by a multiplier."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from omegaconf import DictConfig
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+
+from torchrl_safe import GMMTanhPolicy, TrustRegionSafeOptimizer
+from torchrl_safe.objectives import LagrangeMultiplier, PIDMultiplier, lagrangian
+from torchrl_safe.objectives.functional import moment_matched_kl
+
+
+def policy_kl(old: TensorDictBase, new: TensorDictBase) -> Tensor:
+    """The trust region's distance (15), averaged over states."""
+    return moment_matched_kl(old["mean"], old["cov"], new["mean"], new["cov"]).mean()
+
+
+def make_trust_region(cfg: DictConfig, policy: GMMTanhPolicy) -> TrustRegionSafeOptimizer:
+    """The optimizer of the policy, with the options of the configuration."""
+    return TrustRegionSafeOptimizer(
+        policy.parameters(),
+        max_kl=cfg.optim.max_kl,
+        damping=cfg.optim.damping,
+        cg_iters=cfg.optim.cg_iters,
+        backtrack_ratio=cfg.optim.backtrack_ratio,
+        max_backtracks=cfg.optim.max_backtracks,
+        recovery_ratio=cfg.optim.recovery_ratio,
+        statistics_kl=policy_kl,
+    )
+
+
+def cost_limit_at(cfg: DictConfig, frames: int) -> float:
+    """The limit of now: it falls, so that the agent learns to drive before it has to avoid."""
+    remaining = max(0.0, 1.0 - frames / max(1, cfg.loss.anneal_frames))
+    return cfg.loss.cost_limit + remaining * (cfg.loss.initial_cost_limit - cfg.loss.cost_limit)
+
+
+class Multiplier:
+    """The multiplier of the configuration, and the optimizer of one that learns by gradient."""
+
+    def __init__(self, cfg: DictConfig, kind: str) -> None:
+        self.module: LagrangeMultiplier | PIDMultiplier
+        self.optim: torch.optim.Optimizer | None = None
+        if kind == "pid":
+            self.module = PIDMultiplier(
+                kp=cfg.pid.kp, ki=cfg.pid.ki, kd=cfg.pid.kd, init=cfg.lagrangian.init
+            )
+        else:
+            self.module = LagrangeMultiplier(init=cfg.lagrangian.init)
+            self.optim = torch.optim.Adam(self.module.parameters(), lr=cfg.lagrangian.lr)
+
+    def __call__(self) -> Tensor:
+        """The multiplier, ``[1]``."""
+        return self.module()
+
+    def update(self, constraint: Tensor) -> None:
+        """React to the measured constraint, ``[1]``."""
+        if self.optim is None:
+            self.module.update(constraint)
+            return
+        self.optim.zero_grad()
+        self.module.loss(constraint).backward()
+        self.optim.step()
+
+    def state_dict(self) -> dict[str, Any]:
+        """The multiplier and the state of its optimizer."""
+        optim = None if self.optim is None else self.optim.state_dict()
+        return {"module": self.module.state_dict(), "optim": optim}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Put both back."""
+        self.module.load_state_dict(state["module"])
+        if self.optim is not None:
+            self.optim.load_state_dict(state["optim"])
+
+
+def ascend(
+    optim: torch.optim.Optimizer, closure: Callable[[], TensorDict], multiplier: Tensor
+) -> dict[str, float]:
+    """One gradient step up the Lagrangian of a trust region's closure."""
+    out = closure()
+    value = lagrangian(out["objective"], out["constraint"], multiplier)
+    optim.zero_grad()
+    (-value).backward()
+    optim.step()
+    return {"update/lagrangian": value.item(), "update/multiplier": multiplier.item()}

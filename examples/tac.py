@@ -1,0 +1,63 @@
+"""Tsallis actor-critic (Lee et al. 2020), without a constraint: SAC's script with another loss.
+
+    python examples/tac.py                          # train, evaluate, film
+    python examples/tac.py loss.entropic_index=1    # SAC
+
+Every option is in tac.yaml and base.yaml beside this file.
+"""
+
+from __future__ import annotations
+
+import hydra
+import torch
+from critics import REPLAYED
+from omegaconf import DictConfig
+from tensordict import TensorDictBase
+from torchrl._utils import timeit
+from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
+from torchrl.objectives import SoftUpdate
+from utils import EVAL_SEED, Run, make_critic, make_env, make_policy, set_up, train
+
+from torchrl_safe import TsallisLoss
+
+
+@hydra.main(config_path=".", config_name="tac", version_base="1.3")
+def main(cfg: DictConfig) -> None:
+    """Train, evaluate and film an agent."""
+    set_up(cfg)
+    eval_env = make_env(cfg, cfg.eval.num_episodes, EVAL_SEED)
+    policy = make_policy(cfg, eval_env)
+    loss = TsallisLoss(
+        policy,
+        make_critic(cfg, eval_env, "state_action_value"),
+        entropic_index=cfg.loss.entropic_index,
+        alpha_init=cfg.loss.alpha,
+        deactivate_vmap=True,
+    )
+    loss.make_value_estimator(gamma=cfg.loss.gamma)
+    target = SoftUpdate(loss, tau=cfg.optim.tau)
+    optim = torch.optim.Adam(loss.parameters(), lr=cfg.optim.lr)
+    buffer = TensorDictReplayBuffer(
+        storage=LazyTensorStorage(cfg.replay_buffer.size), batch_size=cfg.optim.minibatch_size
+    )
+    run = Run(cfg, loss=loss, optim=optim, buffer=buffer)
+
+    def update(batch: TensorDictBase) -> dict[str, float]:
+        """Gradient steps on replayed transitions."""
+        buffer.extend(batch.select(*REPLAYED).flatten())
+        if run.frames < cfg.collector.init_frames:
+            return {}
+        with timeit("time/update"):
+            for _ in range(cfg.optim.num_updates):
+                losses = loss(buffer.sample())
+                optim.zero_grad()
+                sum(value for name, value in losses.items() if name.startswith("loss_")).backward()
+                optim.step()
+                target.step()
+        return {f"update/{name}": value.item() for name, value in losses.items()}
+
+    train(run, policy, update, eval_env)
+
+
+if __name__ == "__main__":
+    main()

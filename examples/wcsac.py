@@ -1,0 +1,114 @@
+"""WCSAC: worst-case soft actor-critic (Yang et al. 2021), SAC with a multiplier on the CVaR.
+
+    python examples/wcsac.py                        # train, evaluate, film
+    python examples/wcsac.py loss.risk_level=0.5    # the worst half of outcomes, not an eighth
+
+Every option is in wcsac.yaml and base.yaml beside this file.
+"""
+
+from __future__ import annotations
+
+import hydra
+import torch
+from critics import REPLAYED
+from omegaconf import DictConfig
+from policy_steps import Multiplier, cost_limit_at
+from tensordict import TensorDictBase
+from torch import nn
+from torchrl._utils import timeit
+from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
+from torchrl.objectives import SoftUpdate, ValueEstimators
+from utils import EVAL_SEED, Run, make_critic, make_env, make_policy, set_up, train
+
+from torchrl_safe import CVaRCostLoss, TsallisLoss
+from torchrl_safe.objectives import lagrangian
+from torchrl_safe.objectives.functional import q_logarithm
+
+
+def run_wcsac(cfg: DictConfig) -> None:
+    """Train, evaluate and film an agent; at ``risk_level=1`` the algorithm is SAC-Lagrangian."""
+    set_up(cfg)
+    eval_env = make_env(cfg, cfg.eval.num_episodes, EVAL_SEED)
+    policy = make_policy(cfg, eval_env)
+    reward_loss = TsallisLoss(
+        policy,
+        make_critic(cfg, eval_env, "state_action_value"),
+        entropic_index=cfg.loss.entropic_index,
+        alpha_init=cfg.loss.alpha,
+        deactivate_vmap=True,
+    )
+    cost_loss = CVaRCostLoss(
+        policy,
+        make_critic(cfg, eval_env, "cost_value"),
+        make_critic(cfg, eval_env, "cost_std", nn.Softplus()),
+        risk_level=cfg.loss.risk_level,
+        cost_limit=cfg.loss.cost_limit,
+        delay_cost=True,
+        deactivate_vmap=True,
+    )
+    reward_loss.make_value_estimator(ValueEstimators.TD0, gamma=cfg.loss.gamma)
+    cost_loss.make_value_estimator(ValueEstimators.TD0, gamma=cfg.loss.cost_gamma)
+    targets = [SoftUpdate(loss, tau=cfg.optim.tau) for loss in (reward_loss, cost_loss)]
+    # The policy's parameters are in both losses.
+    params = dict.fromkeys([*reward_loss.parameters(), *cost_loss.parameters()])
+    optim = torch.optim.Adam(list(params), lr=cfg.optim.lr)
+    multiplier = Multiplier(cfg, "lagrangian")
+    buffer = TensorDictReplayBuffer(
+        storage=LazyTensorStorage(cfg.replay_buffer.size), batch_size=cfg.optim.minibatch_size
+    )
+    run = Run(
+        cfg,
+        reward_loss=reward_loss,
+        cost_loss=cost_loss,
+        optim=optim,
+        multiplier=multiplier,
+        buffer=buffer,
+    )
+
+    def update(batch: TensorDictBase) -> dict[str, float]:
+        """The multiplier on the new batch's cost, then gradient steps on replayed transitions."""
+        buffer.extend(batch.select(*REPLAYED).flatten())
+        if run.frames < cfg.collector.init_frames:
+            return {}
+        limit = cost_limit_at(cfg, run.frames)
+        cost_loss.cost_limit.fill_(limit)
+        level = cost_loss.on_policy_cvar(batch)
+        multiplier.update((level - limit)[None])
+        with timeit("time/update"):
+            for _ in range(cfg.optim.num_updates):
+                minibatch = buffer.sample()
+                losses = cost_loss(minibatch)
+                losses["loss_qvalue"], _ = reward_loss.qvalue_v2_loss(minibatch)
+                action, log_prob = policy.get_dist(minibatch).rsample_and_log_prob()
+                losses["loss_actor"] = -lagrangian(
+                    reward_loss.objective(minibatch, action, log_prob).mean(),
+                    cost_loss.constraint(minibatch, action)[None],
+                    multiplier(),
+                )
+                entropy = -q_logarithm(log_prob.detach(), cfg.loss.entropic_index)
+                losses["loss_alpha"] = reward_loss.alpha_loss(-entropy).mean()
+                optim.zero_grad()
+                sum(loss for name, loss in losses.items() if name.startswith("loss_")).backward()
+                optim.step()
+                for target in targets:
+                    target.step()
+        metrics = {f"update/{name}": value.item() for name, value in losses.items()}
+        return {
+            **metrics,
+            "update/constraint": level.item(),
+            "update/cost_limit": limit,
+            "update/multiplier": multiplier().item(),
+            "update/alpha": reward_loss.log_alpha.exp().item(),
+        }
+
+    train(run, policy, update, eval_env)
+
+
+@hydra.main(config_path=".", config_name="wcsac", version_base="1.3")
+def main(cfg: DictConfig) -> None:
+    """WCSAC as configured in wcsac.yaml."""
+    run_wcsac(cfg)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,110 @@
+"""The scripts of the baselines and the ablations, from the configuration to the results."""
+
+from __future__ import annotations
+
+import importlib
+import json
+import math
+from pathlib import Path
+
+import hydra
+import pytest
+import torch
+import utils
+from tensordict import TensorDict
+
+from torchrl_safe import record
+
+EXAMPLES = Path(utils.__file__).parent
+TINY = [
+    "num_threads=1",
+    "env.num_envs=20",
+    "env.episode_length=50",
+    "collector.frames_per_batch=400",
+    "collector.init_frames=400",
+    "policy.num_cells=[16]",
+    "critic.num_cells=[16]",
+    "eval.interval=1200",
+    "eval.num_episodes=2",
+    "eval.num_steps=20",
+    "eval.final_episodes=2",
+    "checkpoint.interval=400",
+    "video.num_steps=0",
+]
+GRADIENT = ["replay_buffer.size=5000", "optim.num_updates=2", "optim.minibatch_size=50"]
+SURROGATE = ["optim.critic_rounds=1", "optim.minibatch_size=200"]
+REPLAY = ["replay_buffer.size=5000", "optim.critic_frames=400", "optim.policy_frames=400"]
+
+METHODS = {
+    "tac": ("tac", GRADIENT, {"update/loss_qvalue", "update/alpha"}),
+    "wcsac": ("wcsac", GRADIENT, {"update/loss_cost_std", "update/multiplier"}),
+    "sac_lagrangian": ("sac_lagrangian", GRADIENT, {"update/loss_actor", "update/multiplier"}),
+    "cpo": ("cpo", SURROGATE, {"update/kl", "update/loss_cost_value"}),
+    "trc": ("trc", SURROGATE, {"update/kl", "update/loss_cost_variance"}),
+    "offpolicy_trc": ("offpolicy_trc", [*SURROGATE, *REPLAY], {"update/kl", "update/loss_value"}),
+    "safetac_lagrangian": (
+        "safetac_point",
+        ["update=lagrangian", *SURROGATE, *REPLAY],
+        {"update/multiplier", "update/loss_cost_std"},
+    ),
+    "safetac_pid": (
+        "safetac_point",
+        ["update=pid", *SURROGATE, *REPLAY],
+        {"update/multiplier", "update/loss_cost_std"},
+    ),
+}
+
+
+def launch(name: str, run_dir: Path, *overrides: str) -> None:
+    with hydra.initialize_config_dir(str(EXAMPLES), version_base="1.3"):
+        cfg = hydra.compose(name, [f"run_dir={run_dir}", *TINY, *overrides])
+    importlib.import_module(name).main.__wrapped__(cfg)
+
+
+@pytest.mark.parametrize("method", sorted(METHODS.keys() - {"cpo", "sac_lagrangian"}))
+def test_resumes_exactly(tmp_path, method):
+    """Two halves are one run: multipliers and target networks are in a checkpoint, too."""
+    script, overrides, logged = METHODS[method]
+    whole, halves = tmp_path / "whole", tmp_path / "halves"
+    launch(script, whole, *overrides, "collector.total_frames=1600")
+    launch(script, halves, *overrides, "collector.total_frames=800")
+    launch(script, halves, *overrides, "collector.total_frames=1600", "resume=true")
+
+    curves, others = (record.read_metrics(path / "log") for path in (whole, halves))
+    assert logged <= curves.keys()
+    for name in curves:
+        if name.startswith(("train/", "update/")):
+            assert curves[name][0].tolist() == others[name][0].tolist(), name
+            torch.testing.assert_close(
+                curves[name][1], others[name][1], rtol=0, atol=0, equal_nan=True, msg=name
+            )
+    results = json.loads((halves / "results.json").read_text())
+    assert results["frames"] == 1600
+    assert math.isfinite(results["eval/score"])
+
+
+@pytest.mark.parametrize("method", ["sac_lagrangian", "cpo"])
+def test_policy_can_be_loaded(tmp_path, method):
+    script, overrides, logged = METHODS[method]
+    launch(script, tmp_path / "run", *overrides, "collector.total_frames=800")
+    assert logged <= record.read_metrics(tmp_path / "run" / "log").keys()
+    policy = utils.load_policy(tmp_path / "run")
+    states = TensorDict({"observation": torch.randn(3, 24)}, [3])
+    assert policy(states)["action"].shape == (3, 2)
+
+
+@pytest.mark.parametrize("method", ["trc", "safetac_pid"])
+def test_limit_falls_as_configured(tmp_path, method):
+    script, overrides, _ = METHODS[method]
+    schedule = ["loss.initial_cost_limit=9.0", "loss.cost_limit=5.0", "loss.anneal_frames=800"]
+    launch(script, tmp_path / "run", *overrides, *schedule, "collector.total_frames=1200")
+    frames, limits = record.read_metrics(tmp_path / "run" / "log")["update/cost_limit"]
+    assert frames.tolist() == [400, 800, 1200]
+    assert limits.tolist() == pytest.approx([7.0, 5.0, 5.0])
+
+
+@pytest.mark.parametrize(("kind", "name"), [("pid", "pid.ki"), ("lagrangian", "lagrangian.init")])
+def test_impossible_gain(tmp_path, kind, name):
+    with pytest.raises(ValueError, match=f"{name} must be a number"):
+        launch("safetac_point", tmp_path / "run", f"update={kind}", f"{name}=-1")
+    assert not (tmp_path / "run").exists()

@@ -1,0 +1,170 @@
+"""Runs the missing cells of one of the paper's tables, two at a time.
+
+    python benchmarks/paper/run_table.py table_1 --robots point car --seeds 0 1 2
+    python benchmarks/paper/run_table.py table_3 --seeds 0 1 2 --set collector.total_frames=1000000
+    python benchmarks/paper/run_table.py frontier --seeds 0
+    python benchmarks/paper/run_table.py table_1 --dry-run
+
+A cell is a method, a robot and a seed. Finished cells are skipped; an interrupted one goes on from
+its checkpoint, so that the same command can be given again after any stop. Ctrl-C saves all cells
+that are running. Hydra's multirun restarts every job of a sweep and its joblib launcher saw its
+last release in 2022, so that cells are processes of their own here.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import shutil
+import signal
+import subprocess
+import sys
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import NamedTuple
+
+ROOT = Path(__file__).parents[2]
+
+SAFETAC = ("safetac_point", "policy.num_components=1")
+METHODS: dict[str, tuple[str, ...]] = {
+    "safetac_q14": (*SAFETAC, "loss.entropic_index=1.4"),
+    "safetac_q12": (*SAFETAC, "loss.entropic_index=1.2"),
+    "safetac_q10": (*SAFETAC, "loss.entropic_index=1.0"),
+    "trc": ("trc",),
+    "offpolicy_trc": ("offpolicy_trc",),
+    "wcsac": ("wcsac",),
+    "sac_lagrangian": ("sac_lagrangian",),
+    "cpo": ("cpo",),
+    "safetac_k3": ("safetac_point", "policy.num_components=3", "loss.entropic_index=1.2"),
+    "safetac_k5": ("safetac_point", "policy.num_components=5", "loss.entropic_index=1.2"),
+    "safetac_lmbda0": (*SAFETAC, "loss.entropic_index=1.0", "loss.lmbda=0"),
+    "safetac_lagrangian": (*SAFETAC, "loss.entropic_index=1.0", "update=lagrangian"),
+    "safetac_pid": (*SAFETAC, "loss.entropic_index=1.0", "update=pid"),
+}
+"""Script and overrides of each method; names are those of the folders in ``runs/paper``."""
+
+LIMITS = (2.5, 5.5, 10.0)
+"""Cost limits of the frontier."""
+
+TABLES: dict[str, Sequence[str]] = {
+    "table_1": [
+        *("safetac_q14", "safetac_q12", "safetac_q10", "trc", "offpolicy_trc"),
+        *("wcsac", "sac_lagrangian", "cpo"),
+    ],
+    "table_3": [
+        *("safetac_q12", "safetac_k3", "safetac_k5", "safetac_q10"),
+        *("safetac_lmbda0", "safetac_lagrangian", "safetac_pid"),
+    ],
+    "frontier": ["safetac_q12", "trc", "wcsac", "cpo"],
+}
+
+
+class Cell(NamedTuple):
+    """A run: its folder below the results' folder, its script and its overrides."""
+
+    folder: Path
+    script: str
+    overrides: tuple[str, ...]
+
+
+def cells(
+    table: str, robots: Sequence[str], seeds: Sequence[int], methods: Sequence[str] | None = None
+) -> list[Cell]:
+    """All cells of a table, seed by seed: a table with few seeds is complete as early as it can."""
+    limits = [f"loss.cost_limit={limit}" for limit in LIMITS] if table == "frontier" else [""]
+    out = []
+    for seed in seeds:
+        for robot in robots:
+            for method in methods or TABLES[table]:
+                script, *overrides = METHODS[method]
+                for limit in limits:
+                    name = f"{method}_limit{limit.partition('=')[2]}" if limit else method
+                    more = [limit] if limit else []
+                    options = (*overrides, *more, f"env.robot={robot}", f"seed={seed}")
+                    out.append(Cell(Path(robot, name, f"seed_{seed}"), script, options))
+    return out
+
+
+def command(cell: Cell, root: Path, extra: Sequence[str]) -> list[str] | None:
+    """What runs a cell, or goes on with it; ``None`` if it is finished.
+
+    A run that was stopped before its first checkpoint has nothing to go on from: its folder is
+    removed.
+    """
+    run_dir = root / cell.folder
+    if (run_dir / "results.json").exists():
+        return None
+    script = ROOT / "examples" / f"{cell.script}.py"
+    out = [sys.executable, str(script), *cell.overrides, *extra, f"run_dir={run_dir}"]
+    if any((run_dir / "checkpoints").glob("*")):
+        return [*out, "resume=true"]
+    if (run_dir / "config.yaml").exists():
+        shutil.rmtree(run_dir)
+    return out
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the cells; the exit status is the number of those that failed."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("table", choices=TABLES)
+    parser.add_argument("--robots", nargs="+", default=["point"])
+    parser.add_argument("--seeds", nargs="+", type=int, default=[0])
+    parser.add_argument("--methods", nargs="+", choices=METHODS, help="only these")
+    parser.add_argument("--set", nargs="+", default=[], help="overrides for all cells")
+    parser.add_argument("--root", type=Path, default=ROOT / "runs" / "paper")
+    parser.add_argument("--jobs", type=int, default=2, help="cells at a time")
+    parser.add_argument("--dry-run", action="store_true", help="print the commands")
+    args = parser.parse_args(argv)
+
+    extra = ["num_threads=1", "video.num_steps=0", *args.set]
+    todo = []
+    for cell in cells(args.table, args.robots, args.seeds, args.methods):
+        finished = (args.root / cell.folder / "results.json").exists()
+        print(f"{'finished' if finished else 'to run':10}{cell.folder}")
+        if not finished:
+            todo.append(cell)
+
+    running: set[subprocess.Popen[bytes]] = set()
+    stopping = False
+
+    def stop(number: int, frame: object) -> None:
+        nonlocal stopping
+        stopping = True
+        for process in tuple(running):
+            process.send_signal(signal.SIGINT)  # the run saves and ends
+
+    def run(cell: Cell) -> int:
+        line = None if stopping else command(cell, args.root, extra)
+        if line is None:
+            return 0
+        log = args.root / cell.folder.parent / f"{cell.folder.name}.log"
+        log.parent.mkdir(parents=True, exist_ok=True)
+        env = {"OMP_NUM_THREADS": "1", **os.environ}
+        with log.open("ab") as file:
+            # Of a session of its own: a Ctrl-C reaches it once, from here.
+            process = subprocess.Popen(
+                line, stdout=file, stderr=file, env=env, start_new_session=True
+            )
+            running.add(process)
+            status = process.wait()
+            running.discard(process)
+        outcome = "done" if (args.root / cell.folder / "results.json").exists() else "stopped"
+        print(f"{f'status {status}' if status else outcome:10}{cell.folder}", flush=True)
+        return int(status != 0)
+
+    if args.dry_run:
+        for cell in todo:
+            print(*(command(cell, args.root, extra) or ()))
+        return 0
+    previous = {number: signal.signal(number, stop) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        with ThreadPoolExecutor(args.jobs) as pool:
+            return sum(pool.map(run, todo))
+    finally:
+        for number, handler in previous.items():
+            signal.signal(number, handler)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,104 @@
+"""The paper's tables: which cells are run, and what their numbers are made of."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import config
+import hydra
+import make_table
+import numpy as np
+import pytest
+import run_table
+from torchrl.record import CSVLogger
+
+ROOT = Path(__file__).parents[2]
+
+
+class TestCells:
+    @pytest.mark.parametrize("table", run_table.TABLES)
+    def test_every_cell_is_a_valid_configuration(self, table):
+        for cell in run_table.cells(table, ["point"], [0]):
+            with hydra.initialize_config_dir(str(ROOT / "examples"), version_base="1.3"):
+                config.check_config(hydra.compose(cell.script, list(cell.overrides)))
+
+    @pytest.mark.parametrize("table", run_table.TABLES)
+    def test_no_two_share_a_folder(self, table):
+        folders = [c.folder for c in run_table.cells(table, ["point", "car"], [0, 1])]
+        assert len(set(folders)) == len(folders)
+
+    def test_finished_interrupted_and_torn(self, tmp_path):
+        done, stopped, torn, new = run_table.cells("table_1", ["point"], [0])[:4]
+        for cell in (done, stopped, torn):
+            (tmp_path / cell.folder).mkdir(parents=True)
+            (tmp_path / cell.folder / "config.yaml").touch()
+        (tmp_path / done.folder / "results.json").touch()
+        (tmp_path / stopped.folder / "checkpoints" / "step_400").mkdir(parents=True)
+        assert run_table.command(done, tmp_path, []) is None
+        assert run_table.command(stopped, tmp_path, [])[-1] == "resume=true"
+        assert "resume=true" not in run_table.command(torn, tmp_path, [])
+        assert not (tmp_path / torn.folder).exists()
+        assert f"run_dir={tmp_path / new.folder}" in run_table.command(new, tmp_path, [])
+
+    def test_runs_skips_and_counts_failures(self, tmp_path, capfd):
+        """Cells are real processes: one override is impossible, so that each fails at once."""
+        argv = ["table_3", "--root", str(tmp_path), "--methods", "safetac_k3", "safetac_k5"]
+        (tmp_path / "point" / "safetac_k3" / "seed_0").mkdir(parents=True)
+        (tmp_path / "point" / "safetac_k3" / "seed_0" / "results.json").touch()
+        assert run_table.main([*argv, "--set", "loss.risk_level=2"]) == 1
+        assert "risk_level" in (tmp_path / "point" / "safetac_k5" / "seed_0.log").read_text()
+        assert "finished  point/safetac_k3" in capfd.readouterr().out
+
+
+class TestStatistics:
+    def test_iqm(self):
+        assert make_table.iqm(np.array([-100.0, 1.0, 2.0, 100.0])) == 1.5
+
+    def test_interval_covers_the_mean(self):
+        """Of 200 samples of a known mean, about 95 % of the intervals hold it."""
+        rng = np.random.default_rng(1)
+        samples = rng.normal(3.0, 1.0, (200, 2, 20))
+        hits = 0
+        for tasks in samples:
+            low, high = make_table.stratified_interval(tasks, np.mean, num_resamples=200)
+            hits += low <= 3.0 <= high
+        assert 0.88 <= hits / 200 <= 0.99
+
+    def test_strata_are_kept(self):
+        """Seeds that agree within their task leave nothing to chance, however tasks differ."""
+        low, high = make_table.stratified_interval([np.zeros(3), np.ones(3)], np.mean)
+        assert low == high == 0.5
+
+    def test_one_seed_has_no_interval(self):
+        assert np.isnan(make_table.stratified_interval([np.ones(1)], make_table.iqm)).all()
+
+
+def test_table():
+    run = dict.fromkeys(make_table.COLUMNS.values(), 2.0)
+    text = make_table.table({"cpo": [{**run, "frames": 1000}, {**run, "frames": 900}]})
+    assert text.splitlines()[-1].startswith("| cpo | 2 | 900 | 2, IQM 2 (2 to 2) |")
+
+
+def test_from_runs_to_pictures(tmp_path):
+    """A run that is not finished, and the logs of the cells, are left alone."""
+    for name, finished in (("cpo_limit2.5", True), ("cpo_limit5.5", True), ("trc", False)):
+        run_dir = tmp_path / "point" / name / "seed_0"
+        logger = CSVLogger("log", log_dir=str(run_dir))
+        for frames in (400, 800):
+            for metric in ("reward_per_1000", "cv_rate", "total_cvs"):
+                logger.log_scalar(f"train/{metric}", 0.1, step=frames)
+        for file in logger.experiment.files.values():
+            file.close()
+        run_dir.with_name("seed_0.log").touch()
+        (run_dir / "config.yaml").touch()
+        if finished:
+            results = {**dict.fromkeys(make_table.COLUMNS.values(), 1.0), "frames": 800}
+            (run_dir / "results.json").write_text(json.dumps(results))
+    make_table.main([str(tmp_path / "point"), str(tmp_path / "out")])
+    text = (tmp_path / "out" / "table.md").read_text()
+    assert "cpo_limit2.5" in text
+    assert "trc" not in text
+    for name in ("curves.png", "frontier.png"):
+        assert (tmp_path / "out" / name).stat().st_size > 5_000
+    assert (tmp_path / "out" / "cpo_limit5.5" / "seed_0" / "curves.csv").exists()

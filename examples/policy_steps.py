@@ -50,9 +50,11 @@ class Multiplier:
             self.module = PIDMultiplier(
                 kp=cfg.pid.kp, ki=cfg.pid.ki, kd=cfg.pid.kd, init=cfg.lagrangian.init
             )
-        else:
+        elif kind == "lagrangian":
             self.module = LagrangeMultiplier(init=cfg.lagrangian.init)
             self.optim = torch.optim.Adam(self.module.parameters(), lr=cfg.lagrangian.lr)
+        else:
+            raise ValueError(f"kind must be 'lagrangian' or 'pid', got {kind!r}.")
 
     def __call__(self) -> Tensor:
         """The multiplier, ``[1]``."""

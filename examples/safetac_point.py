@@ -86,11 +86,11 @@ def main(cfg: DictConfig) -> None:
     critic_optim = make_critic_optim(cfg, reward_loss, cost_loss)
     buffer = make_buffer(cfg)
     components = {}
-    if cfg.update == "trust_region":
+    if cfg["update"] == "trust_region":  # as an attribute, update is a method of the configuration
         policy_optim = make_trust_region(cfg, policy)
     else:  # (9), the ablation
         policy_optim = torch.optim.Adam(policy.parameters(), lr=cfg.lagrangian.policy_lr)
-        components["multiplier"] = multiplier = Multiplier(cfg, cfg.update)
+        components["multiplier"] = multiplier = Multiplier(cfg, cfg["update"])
     run = Run(
         cfg,
         reward_loss=reward_loss,
@@ -112,7 +112,7 @@ def main(cfg: DictConfig) -> None:
         with timeit("time/policy"):
             visited = batch.select("observation").flatten()
             level = cost_loss.on_policy_cvar(batch)
-            if cfg.update == "trust_region":
+            if cfg["update"] == "trust_region":
                 states = visited[torch.randperm(len(visited))[: cfg.optim.policy_frames]]
                 closure = policy_closure(
                     policy, reward_loss, cost_loss, states, level, cfg.optim.curvature_frames

@@ -103,6 +103,30 @@ def test_limit_falls_as_configured(tmp_path, method):
     assert limits.tolist() == pytest.approx([7.0, 5.0, 5.0])
 
 
+def test_update_chooses_how_the_policy_moves(tmp_path):
+    """Same seed, so that runs differ by the update alone; only a trust region has a KL."""
+    overrides = [*SURROGATE, *REPLAY, "collector.total_frames=800"]
+    curves = {}
+    for update in ("trust_region", "lagrangian", "pid"):
+        launch("safetac_point", tmp_path / update, f"update={update}", *overrides)
+        curves[update] = record.read_metrics(tmp_path / update / "log")
+    launch("safetac_point", tmp_path / "default", *overrides)
+    default = record.read_metrics(tmp_path / "default" / "log")
+    assert default["update/kl"][1].tolist() == curves["trust_region"]["update/kl"][1].tolist()
+    assert (default["update/kl"][1] > 0).all()
+    assert "update/multiplier" not in default
+    for update in ("lagrangian", "pid"):
+        assert "update/kl" not in curves[update]
+
+    def multipliers(update: str) -> list[float]:
+        return curves[update]["update/multiplier"][1].tolist()
+
+    assert multipliers("lagrangian") != multipliers("pid")
+    constraint = curves["pid"]["update/constraint"][1] - curves["pid"]["update/cost_limit"][1]
+    first = 0.05 * constraint[0] + 0.01 * max(0.0, 1.0 / 0.01 + constraint[0])
+    assert multipliers("pid")[0] == pytest.approx(first, rel=1e-3)
+
+
 @pytest.mark.parametrize(("kind", "name"), [("pid", "pid.ki"), ("lagrangian", "lagrangian.init")])
 def test_impossible_gain(tmp_path, kind, name):
     with pytest.raises(ValueError, match=f"{name} must be a number"):

@@ -123,7 +123,7 @@ def test_update_chooses_how_the_policy_moves(tmp_path):
 
     assert multipliers("lagrangian") != multipliers("pid")
     constraint = curves["pid"]["update/constraint"][1] - curves["pid"]["update/cost_limit"][1]
-    first = 0.05 * constraint[0] + 0.01 * max(0.0, 1.0 / 0.01 + constraint[0])
+    first = 0.05 * constraint[0] + 0.01 * max(0.0, 0.1 / 0.01 + constraint[0])
     assert multipliers("pid")[0] == pytest.approx(first, rel=1e-3)
 
 

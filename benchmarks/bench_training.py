@@ -11,12 +11,12 @@ import sys
 import tempfile
 from pathlib import Path
 
+import hydra
 import numpy as np
-from omegaconf import OmegaConf
 
 from torchrl_safe.record import format_table, read_metrics
 
-EXAMPLE = Path(__file__).parents[1] / "examples" / "safetac_point.py"
+EXAMPLE = Path(__file__).resolve().parents[1] / "examples" / "safetac_point.py"
 NUM_UPDATES = 15
 
 # OmniSafe 0.5's CPO on PointGoal1 with its defaults: steps per second of the whole training loop,
@@ -27,9 +27,8 @@ OMNISAFE_CPO = 129
 
 def main(overrides: list[str]) -> None:
     """Train for a few updates and print the table."""
-    cfg = OmegaConf.merge(
-        OmegaConf.load(EXAMPLE.with_suffix(".yaml")), OmegaConf.from_dotlist(overrides)
-    )
+    with hydra.initialize_config_dir(str(EXAMPLE.parent), version_base="1.3"):
+        cfg = hydra.compose(EXAMPLE.stem, overrides)
     per_batch, warm_up = cfg.collector.frames_per_batch, cfg.collector.init_frames
     total = (-(-warm_up // per_batch) - 1 + NUM_UPDATES) * per_batch
     with tempfile.TemporaryDirectory() as run_dir:

@@ -6,10 +6,10 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import hydra
 import pytest
 import torch
 from critics import make_losses
-from omegaconf import OmegaConf
 from policy_steps import policy_kl
 from safetac_point import policy_closure
 from tensordict import TensorDict
@@ -27,7 +27,7 @@ from torchrl_safe.optim.curvature import (
     hessian_product,
 )
 
-CONFIG = Path(__file__).parents[1] / "examples" / "safetac_point.yaml"
+EXAMPLES = Path(__file__).resolve().parents[1] / "examples"
 NUM_STATES = 5000
 CG_ITERS = 10
 
@@ -37,9 +37,9 @@ def make_closures(
 ) -> tuple[Any, GMMTanhPolicy, TensorDict, Callable[..., Callable[[], TensorDict]]]:
     """Configuration, policy, states, and a maker of closures with an active constraint."""
     torch.manual_seed(0)
-    cfg = OmegaConf.load(CONFIG)
-    cfg.policy.num_cells = cfg.critic.num_cells = [width, width]
-    cfg.policy.num_components = 5
+    widths = [f"policy.num_cells=[{width},{width}]", f"critic.num_cells=[{width},{width}]"]
+    with hydra.initialize_config_dir(str(EXAMPLES), version_base="1.3"):
+        cfg = hydra.compose("safetac_point", [*widths, "policy.num_components=5"])
     env = SafeGoalEnv(num_envs=1, num_threads=1)
     policy = make_policy(cfg, env)
     losses = make_losses(cfg, env, policy)

@@ -29,7 +29,6 @@ def make_collector(
     *,
     seed: int,
     total_frames: int,
-    exploration_type: ExplorationType = ExplorationType.RANDOM,
 ) -> BaseCollector:
     """A collector of batches ``[N, T]`` from ``env.num_envs`` environments.
 
@@ -49,7 +48,6 @@ def make_collector(
     Keyword Args:
         seed (int): of the environments; workers derive theirs from it.
         total_frames (int): when to stop.
-        exploration_type (ExplorationType): how the policy acts.
 
     Raises:
         ValueError: if the backend is unknown, or the workers cannot share the environments equally.
@@ -60,11 +58,12 @@ def make_collector(
     options = {
         "frames_per_batch": cfg.collector.frames_per_batch,
         "total_frames": total_frames,
-        "exploration_type": exploration_type,
+        "exploration_type": ExplorationType.RANDOM,
+        "auto_register_policy_transforms": False,
     }
     if backend == "single":
         env = make_env(num_envs=cfg.env.num_envs, seed=seed)
-        return ResumableCollector(env, policy, auto_register_policy_transforms=False, **options)
+        return ResumableCollector(env, policy, **options)
     if num_workers < 1 or cfg.env.num_envs % num_workers:
         raise ValueError(
             f"collector.num_workers={num_workers} must divide env.num_envs={cfg.env.num_envs}."
@@ -73,7 +72,6 @@ def make_collector(
     creators: list[Callable[[], EnvBase]] = [
         partial(_in_worker, make_env, share, worker_seed(seed, i)) for i in range(num_workers)
     ]
-    options["auto_register_policy_transforms"] = False
     if backend == "multi_sync":
         return MultiSyncCollector(
             creators, policy, cat_results="stack", postproc=_joined, **options

@@ -2,7 +2,7 @@
 
     python examples/cpo.py                          # train, evaluate, film
 
-The algorithm is in trc.py; every option is in cpo.yaml, trc.yaml and base.yaml beside this file.
+The algorithm is in trc.py; every option is in cpo.yaml, trc.yaml, constrained.yaml and base.yaml.
 """
 
 from __future__ import annotations

@@ -2,7 +2,7 @@
 
     python examples/offpolicy_trc.py                # train, evaluate, film
 
-Every option is in offpolicy_trc.yaml, trc.yaml and base.yaml beside this file.
+Every option is in offpolicy_trc.yaml, trc.yaml, constrained.yaml and base.yaml.
 """
 
 from __future__ import annotations

@@ -2,7 +2,8 @@
 
     python examples/sac_lagrangian.py               # train, evaluate, film
 
-The algorithm is in wcsac.py; every option is in sac_lagrangian.yaml, wcsac.yaml and base.yaml.
+The algorithm is in wcsac.py; every option is in sac_lagrangian.yaml, wcsac.yaml,
+constrained.yaml and base.yaml.
 """
 
 from __future__ import annotations

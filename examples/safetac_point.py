@@ -4,7 +4,7 @@
     python examples/safetac_point.py collector.total_frames=100000  # a quick look
     python examples/safetac_point.py resume=true                    # go on after Ctrl-C
 
-Every option is in safetac_point.yaml beside this file.
+Every option is in safetac_point.yaml, constrained.yaml and base.yaml beside this file.
 """
 
 from __future__ import annotations

@@ -3,7 +3,7 @@
     python examples/trc.py                          # train, evaluate, film
     python examples/trc.py loss.risk_level=0.5      # the worst half of outcomes, not an eighth
 
-Every option is in trc.yaml and base.yaml beside this file.
+Every option is in trc.yaml, constrained.yaml and base.yaml beside this file.
 """
 
 from __future__ import annotations

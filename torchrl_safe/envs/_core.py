@@ -227,6 +227,15 @@ class Core:
         """Restarts the random streams; the current layouts stay until they are reset."""
         self._streams = RandomStreams(seed, self.num_envs)
 
+    @property
+    def random_state(self) -> NDArray[np.uint64]:
+        """A copy of where each environment's random stream stands, [N]."""
+        return self._streams.state.copy()
+
+    def rewind(self, mask: Mask, random_state: NDArray[np.uint64]) -> None:
+        """Puts the streams of the environments in ``mask`` [N] back to where they stood."""
+        self._streams.state[mask] = random_state[mask]
+
     def reset(self, mask: Mask | None = None) -> Frame:
         """Starts new episodes.
 

@@ -329,13 +329,11 @@ class GymGoalVectorEnv(gymnasium.vector.VectorEnv[NDArray[Any], NDArray[Any], ND
         if over.any() and self.autoreset_mode is AutoresetMode.DISABLED:
             rows = np.flatnonzero(over).tolist()
             raise RuntimeError(f"reset environments {rows} first: their episodes are over.")
-        streams = self._core.snapshot()["random"] if over.any() else None
+        random_state = self._core.random_state
         frame = self._core.step(actions)
-        if streams is not None:
+        if over.any():
             # Those that are over made a step that nobody sees: it must not draw from their streams.
-            state = self._core.snapshot()
-            state["random"][over] = streams[over]
-            self._core.restore(state)
+            self._core.rewind(over, random_state)
             frame = self._core.reset(over)
         done = frame.terminated | frame.truncated
         infos = _arrays(frame)

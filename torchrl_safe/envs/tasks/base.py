@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import fields
 from typing import Any, Literal, NamedTuple, Protocol
 
@@ -155,6 +156,35 @@ def goal_reward(before: Array, after: Array, goal_radius: float) -> tuple[Array,
     """
     reached = after <= goal_radius
     return before - after + reached, reached
+
+
+def pursue_goal(
+    position: Array,
+    goal: Array,
+    distance: Array,
+    goal_radius: float,
+    draw: Callable[[NDArray[np.integer]], Array],
+) -> tuple[Array, Array, Array, Mask]:
+    """The reward to the goal that a step started with; a reached goal then moves.
+
+    Args:
+        position (array): [N, 2], of the robots after the step.
+        goal (array): [N, 2], left alone.
+        distance (array): [N], to the goal before the step.
+        goal_radius (float): the goal is reached at this distance.
+        draw (callable): new goals [n, 2] for the environments ``rows`` [n] that reached theirs.
+
+    Returns:
+        tuple of arrays: goal [N, 2] and distance [N] after the step, reward [N], goal_met [N].
+    """
+    after = length(goal - position)
+    reward, goal_met = goal_reward(distance, after, goal_radius)
+    if goal_met.any():
+        rows = np.flatnonzero(goal_met)
+        goal = goal.copy()
+        goal[rows] = draw(rows)
+        after[rows] = length(goal[rows] - position[rows])
+    return goal, after, reward, goal_met
 
 
 def observe(

@@ -21,9 +21,9 @@ from torchrl_safe.envs.tasks.base import (
     Prop,
     Sensed,
     check_options,
-    goal_reward,
     length,
     observe,
+    pursue_goal,
 )
 
 _LAYOUT_CANDIDATES = 32  # positions tried for one object before its layout is started again
@@ -127,15 +127,14 @@ class GoalTask:
         streams: RandomStreams,
     ) -> Outcome:
         """The reward to the goal the step started with; a reached goal moves."""
-        goal, hazards = objects["goal"], objects["hazards"]
-        distance = length(goal - motion.position)
-        reward, goal_met = goal_reward(objects["goal_distance"], distance, self.goal_radius)
-        if goal_met.any():
-            rows = np.flatnonzero(goal_met)
-            position = motion.position[rows]
-            goal = goal.copy()
-            goal[rows] = sample_goal(self, robot.keepout, position, hazards[rows], streams, rows)
-            distance[rows] = length(goal[rows] - position)
+        position, hazards = motion.position, objects["hazards"]
+
+        def draw(rows: NDArray[np.integer]) -> Array:
+            return sample_goal(self, robot.keepout, position[rows], hazards[rows], streams, rows)
+
+        goal, distance, reward, goal_met = pursue_goal(
+            position, objects["goal"], objects["goal_distance"], self.goal_radius, draw
+        )
         return Outcome(
             {"goal": goal, "goal_distance": distance, "hazards": hazards},
             reward,

@@ -24,9 +24,9 @@ from torchrl_safe.envs.tasks.base import (
     Prop,
     Sensed,
     check_options,
-    goal_reward,
     length,
     observe,
+    pursue_goal,
 )
 
 _LAYOUT_ATTEMPTS = 200  # layouts drawn before giving up
@@ -158,14 +158,14 @@ class NavigationTask:
         streams: RandomStreams,
     ) -> Outcome:
         """The reward to the goal the step started with; contacts end episodes and are paid for."""
-        goal, boxes = objects["goal"], objects["boxes"]
-        distance = length(goal - motion.position)
-        reward, goal_met = goal_reward(objects["goal_distance"], distance, self.goal_radius)
-        if goal_met.any():
-            rows = np.flatnonzero(goal_met)
-            goal = goal.copy()
-            goal[rows] = sample_goal(self, goal[rows], boxes[rows], streams, rows)
-            distance[rows] = length(goal[rows] - motion.position[rows])
+        last, boxes = objects["goal"], objects["boxes"]
+
+        def draw(rows: NDArray[np.integer]) -> Array:
+            return sample_goal(self, last[rows], boxes[rows], streams, rows)
+
+        goal, distance, reward, goal_met = pursue_goal(
+            motion.position, last, objects["goal_distance"], self.goal_radius, draw
+        )
         left = remaining * sensed.contact
         return Outcome(
             {"goal": goal, "goal_distance": distance, "boxes": boxes},

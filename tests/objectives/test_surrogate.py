@@ -10,7 +10,8 @@ from torch import nn
 from torchrl.modules import ValueOperator
 
 from torchrl_safe.objectives import CVaRSurrogateLoss, ReturnSurrogateLoss
-from torchrl_safe.objectives.functional import gaussian_cvar, surrogate_change
+from torchrl_safe.objectives.functional import cvar_factor, gaussian_cvar, surrogate_change
+from torchrl_safe.objectives.surrogate import CostMoments
 
 GAMMA = 0.8
 STATES, ACTIONS = 3, 2
@@ -131,6 +132,93 @@ def test_a_bandits_cvar_is_followed_exactly(risk_level):
     mean = (new * cost).sum(1).mean()
     std = ((new * cost.square()).sum(1).mean() - mean.square()).sqrt()
     torch.testing.assert_close(constraint, gaussian_cvar(mean, std, risk_level) - 0.7)
+
+
+class CostChain(MDP):
+    """Costs in place of rewards; six states, few successors each, and the moments of their sum."""
+
+    GAMMA = 0.95
+
+    def __init__(self, seed: int) -> None:
+        rng = np.random.default_rng(seed)
+        self.transition = rng.dirichlet(np.full(6, 0.3), (6, 2))
+        self.cost = rng.random((6, 2)) + 1.0
+        self.logits = rng.normal(size=(6, 2))
+        moves = np.einsum("sa,sat->st", softmax(self.logits), self.transition)
+        self.start = np.linalg.matrix_power(moves, 2000)[0]  # where the policy is
+
+    def moments(self, logits: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """First two moments of the discounted cost sum, per state, by linear equations."""
+        policy, gamma = softmax(logits), self.GAMMA
+        moves = np.einsum("sa,sat->st", policy, self.transition)
+        mean = np.linalg.solve(np.eye(6) - gamma * moves, (policy * self.cost).sum(1))
+        squares = self.cost**2 + 2 * gamma * self.cost * (self.transition @ mean)
+        return mean, np.linalg.solve(np.eye(6) - gamma**2 * moves, (policy * squares).sum(1))
+
+    def variance(self, logits: np.ndarray) -> float:
+        """Of the sum from a start in ``start``."""
+        mean, square = self.moments(logits)
+        return self.start @ square - (self.start @ mean) ** 2
+
+
+def test_variance_falls_where_that_of_the_mdp_does():
+    """Its gradient against finite differences: of the same size, and the same way but for noise.
+
+    The surrogate leaves out that states visited later differ, so that single chains may disagree.
+    """
+    cosines, sizes = [], []
+    for seed in range(20):
+        chain = CostChain(seed)
+        mean, square = chain.moments(chain.logits)
+        states, actions, following = (x.ravel() for x in np.indices((6, 2, 6)))
+        steps = TensorDict(
+            {
+                "observation": torch.eye(6, dtype=torch.float64)[states][:, None],
+                "action_log_prob": torch.tensor(
+                    np.log(softmax(chain.logits))[states, actions][:, None]
+                ),
+                "next": {
+                    "observation": torch.eye(6, dtype=torch.float64)[following][:, None],
+                    "cost": torch.tensor(chain.cost[states, actions])[:, None, None],
+                    "done": torch.zeros(len(states), 1, 1, dtype=torch.bool),
+                },
+            },
+            [len(states), 1],
+        )
+        loss = CVaRSurrogateLoss(
+            ValueOperator(Table(torch.tensor(mean)), out_keys=["cost_value"]),
+            ValueOperator(Table(torch.tensor(square - mean**2)), out_keys=["cost_variance"]),
+            cost_limit=0.0,
+            risk_level=0.25,
+        )
+        loss.make_value_estimator(gamma=chain.GAMMA, lmbda=0.0)
+        weight = (
+            chain.start[:, None, None] * softmax(chain.logits)[..., None] * chain.transition
+        ).ravel()
+        drawn = np.random.default_rng(seed).choice(len(states), 20_000, p=weight)
+        data = loss.compute_advantage(steps)[drawn]
+        moments = CostMoments(
+            torch.tensor(chain.start @ mean), torch.tensor(chain.variance(chain.logits))
+        )
+        logits = torch.tensor(chain.logits, requires_grad=True)
+        log_prob = logits.log_softmax(1)[states[drawn], actions[drawn]][:, None]
+        cvar = loss.constraint(data, log_prob, moments)
+        loss.risk_level = 1.0
+        deviation = (cvar - loss.constraint(data, log_prob, moments)) / cvar_factor(0.25)
+        assert deviation.item() == pytest.approx(moments.variance.sqrt().item(), rel=1e-9)
+        (deviation.square()).backward()
+        expected, eps = np.zeros((6, 2)), 1e-5
+        for index in np.ndindex(6, 2):
+            step = np.zeros((6, 2))
+            step[index] = eps
+            up, down = (chain.variance(chain.logits + sign * step) for sign in (1, -1))
+            expected[index] = (up - down) / (2 * eps)
+        actual = logits.grad.numpy()
+        norms = np.linalg.norm(actual), np.linalg.norm(expected)
+        cosines.append((actual * expected).sum() / np.prod(norms))
+        sizes.append(norms[0] / norms[1])
+    assert np.median(cosines) > 0.8
+    assert 0.5 < np.median(sizes) < 2
 
 
 def test_level_is_the_discounted_sum():

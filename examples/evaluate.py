@@ -41,8 +41,8 @@ NUM_FILMED = 9
 def load_cost_loss(
     cfg: DictConfig, checkpoint: Path, env: SafeGoalEnv, policy: GMMTanhPolicy
 ) -> CVaRCostLoss | None:
-    """The run's safety critics; None if it trained none."""
-    if "cost_loss" not in Checkpoint.manifest(checkpoint)["components"]:
+    """The safety critics of a run of safetac_point.py; None for the other methods' runs."""
+    if "variance_reward" not in cfg.loss:
         return None
     _, cost_loss = make_losses(cfg, env, policy)
     Checkpoint(cost_loss=cost_loss).load(checkpoint)
@@ -100,7 +100,9 @@ def main(run_dir: Path, episodes: int, seed: int, film: bool) -> dict[str, float
         out / "trajectories.png",
     )
     cost_loss = load_cost_loss(cfg, checkpoint, env, policy)
-    if cost_loss is not None:
+    if cost_loss is None:
+        print("no calibration: only SafeTAC's safety critics are judged here")
+    else:
         try:
             bins = calibration(env, policy, cost_loss, num_steps, seed)
         except ValueError as error:

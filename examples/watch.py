@@ -27,7 +27,7 @@ def look(run_dir: Path) -> str:
     curves = read_metrics(log)
     if not curves:
         return "nothing logged yet"
-    plot_learning_curves(log, run_dir / "curves.png", cost_limit=cfg.loss.cost_limit)
+    plot_learning_curves(log, run_dir / "curves.png")
     frames = int(max(steps[-1] for steps, _ in curves.values()))
     speed = curves["time/frames_per_second"][1][-1]
     total = cfg.collector.total_frames

@@ -7,10 +7,12 @@ import json
 import math
 from pathlib import Path
 
+import evaluate
 import hydra
 import pytest
 import torch
 import utils
+import watch
 from tensordict import TensorDict
 
 from torchrl_safe import record
@@ -91,6 +93,19 @@ def test_policy_can_be_loaded(tmp_path, method):
     policy = utils.load_policy(tmp_path / "run")
     states = TensorDict({"observation": torch.randn(3, 24)}, [3])
     assert policy(states)["action"].shape == (3, 2)
+
+
+@pytest.mark.parametrize("method", ["tac", "wcsac", "trc"])
+def test_run_can_be_watched_and_evaluated(tmp_path, method, capsys):
+    """No method logs all that SafeTAC does: the tools show what there is."""
+    script, overrides, _ = METHODS[method]
+    launch(script, tmp_path / "run", *overrides, "collector.total_frames=800")
+    watch.main(tmp_path / "run", every=1.0, once=True)
+    assert "800 of 800" in capsys.readouterr().out
+    metrics = evaluate.main(tmp_path / "run", episodes=2, seed=5, film=False)
+    assert math.isfinite(metrics["det/score"])
+    assert not any(name.startswith("calibration/") for name in metrics)
+    assert "no calibration" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("method", ["trc", "safetac_pid"])

@@ -118,8 +118,8 @@ def draw(monkeypatch, tmp_path):
 
     monkeypatch.setattr(Figure, "savefig", keep)
 
-    def draw(directory, **kwargs):
-        path = plot_learning_curves(directory, tmp_path / "pictures/curves.png", **kwargs)
+    def draw(directory):
+        path = plot_learning_curves(directory, tmp_path / "pictures/curves.png")
         axes = figures[-1].axes
         lines = [{line.get_label(): line for line in panel.lines} for panel in axes]
         return path, lines, [[text.get_text() for text in panel.texts] for panel in axes]
@@ -182,13 +182,6 @@ def test_values_that_are_not_numbers_leave_gaps(run, draw):
     assert np.isnan(lines[0]["sampled action"].get_ydata()).all()
 
 
-def test_the_limit_given_wins(run, draw):
-    log_full_run(run)
-    _, lines, _ = draw(run_dir(run), cost_limit=1.25)
-    assert set(lines[2]["limit"].get_ydata()) == {1.25}
-    assert lines[2]["limit"].get_linestyle() == "--"
-
-
 @pytest.mark.parametrize(
     ("logged", "panel"),
     [
@@ -205,12 +198,12 @@ def test_the_limit_given_wins(run, draw):
 def test_young_runs(run, draw, logged, panel):
     if logged:
         run.log_scalar(logged, 2.0, step=100)
-    path, lines, texts = draw(run_dir(run), cost_limit=1.5)
+    path, lines, texts = draw(run_dir(run))
     for i in range(3):
         assert bool(lines[i]) == (i == panel)
         assert texts[i] == ([] if i == panel else ["no data yet"])
         # A single point is a line without length.
-        assert all(line.get_marker() == "o" for label, line in lines[i].items() if label != "limit")
+        assert all(line.get_marker() == "o" for line in lines[i].values())
     assert imageio.imread(path).std() > 5
 
 

@@ -65,12 +65,7 @@ def read_metrics(run_dir: str | os.PathLike[str]) -> dict[str, tuple[np.ndarray,
     return metrics
 
 
-def plot_learning_curves(
-    run_dir: str | os.PathLike[str],
-    path: str | os.PathLike[str],
-    *,
-    cost_limit: float | None = None,
-) -> Path:
+def plot_learning_curves(run_dir: str | os.PathLike[str], path: str | os.PathLike[str]) -> Path:
     """Draws score, violation rate and the constraint of a run over environment steps.
 
     The metrics drawn are ``score`` and ``cv_rate`` under ``eval/`` (sampled actions) and
@@ -82,10 +77,6 @@ def plot_learning_curves(
         run_dir (path): as in :func:`read_metrics`.
         path (path): the picture to write; the suffix (``.png``, ``.svg``, ``.pdf``) picks the
             format. Missing parent directories are made.
-
-    Keyword Args:
-        cost_limit (float, optional): limit on the discounted cost sum, drawn dashed. Defaults to
-            the logged ``update/cost_limit``.
 
     Returns:
         Path: the picture.
@@ -122,9 +113,7 @@ def plot_learning_curves(
 
     constraint.set(title="Constraint estimate", ylabel="discounted cost sum")
     _draw(constraint, metrics, "update/constraint", "estimate", color=_BLUE)
-    if constraint.lines and cost_limit is not None:
-        constraint.axhline(cost_limit, label="limit", color=_BLACK, ls="--")
-    elif constraint.lines:
+    if constraint.lines:
         _draw(constraint, metrics, "update/cost_limit", "limit", color=_BLACK, ls="--")
 
     for axes in (score, violations, constraint):

@@ -3,8 +3,8 @@
 python .ci/upstream.py PATH/TO/rl
 
 Moves the functionals and the estimator behind the code that is there, with their exports, enum
-member, docs entry, tests and benchmark. Upstream text that is not found as expected stops it before
-anything is written.
+member, docs entry, tests and benchmark; the losses' own tests learn of the new member. Upstream
+text that is not found as expected stops it before anything is written.
 """
 
 from __future__ import annotations
@@ -22,7 +22,11 @@ ESTIMATES = [
     "q_lambda_return_estimate",
 ]
 SAFETAC_ONLY = {"retrace_variance_reward", "squared_td_error", "_one_step_cost"}
-FUTURE = "from __future__ import annotations\n"
+MAIN = """
+
+if __name__ == "__main__":
+    pytest.main([__file__, *sys.argv[1:]])
+"""
 
 
 def definitions(path: str, without: set[str] = frozenset()) -> str:
@@ -34,7 +38,7 @@ def definitions(path: str, without: set[str] = frozenset()) -> str:
         if isinstance(node, (ast.FunctionDef, ast.ClassDef)) and node.name not in without:
             first = min([node.lineno, *(line.lineno for line in node.decorator_list)])
             parts.append("\n".join(lines[first - 1 : node.end_lineno]))
-    return "\n\n\n" + "\n\n\n".join(parts) + "\n"
+    return "\n\n" + "\n\n\n".join(parts) + "\n"
 
 
 def insert(text: str, before: str, addition: str) -> str:
@@ -139,10 +143,28 @@ def main(root: Path) -> None:
                 "from torchrl.objectives.value import RetraceEstimator\n"
                 "from torchrl.objectives.value.functional import retrace_lambda_return_estimate",
             )
-        files[root / f"test/objectives/test_retrace_{name}.py"] = licence + text
+        text = insert(text, "import pytest", "import sys\n\n").replace(
+            "\n\nimport sys", "\nimport sys"
+        )
+        files[root / f"test/objectives/test_retrace_{name}.py"] = licence + text + MAIN
     text = upstream((HERE / "benchmarks/bench_retrace.py").read_text())
     text = text.replace("def bench_", "def test_")
     files[root / "benchmarks/test_retrace_benchmark.py"] = licence + text
+
+    # Upstream's grids run over every member of the enum and list those that a loss rejects.
+    for path in sorted((root / "test/objectives").glob("test_*.py")):
+        text = path.read_text()
+        if path.name == "test_ppo.py":
+            text = text.replace(
+                "list(ValueEstimators) + [None]", "[*PPOLoss.SUPPORTED_VALUE_ESTIMATORS, None]"
+            )
+        elif "list(ValueEstimators)" in text:
+            text = re.sub(
+                r"( +)ValueEstimators\.VTrace,\n", r"\1ValueEstimators.Retrace,\n\g<0>", text
+            )
+        else:
+            continue
+        files[path] = text
 
     for path, text in files.items():
         path.write_text(text)

@@ -9,7 +9,12 @@ from contextlib import nullcontext
 import pytest
 import torch
 from tensordict import TensorDict, TensorDictBase
-from tensordict.nn import NormalParamExtractor, TensorDictModule, set_skip_existing
+from tensordict.nn import (
+    NormalParamExtractor,
+    TensorDictModule,
+    TensorDictSequential,
+    set_skip_existing,
+)
 from torch import Tensor, nn
 from torchrl.data import (
     Bounded,
@@ -19,7 +24,16 @@ from torchrl.data import (
     SliceSampler,
     TensorDictReplayBuffer,
 )
-from torchrl.modules import MLP, OneHotCategorical, ProbabilisticActor, TanhNormal, ValueOperator
+from torchrl.modules import (
+    MLP,
+    GRUModule,
+    LSTMModule,
+    OneHotCategorical,
+    ProbabilisticActor,
+    TanhNormal,
+    ValueOperator,
+    set_recurrent_mode,
+)
 from torchrl.objectives import (
     DDPGLoss,
     DiscreteIQLLoss,
@@ -32,6 +46,7 @@ from torchrl.objectives import (
     TD3Loss,
 )
 from torchrl.objectives.value import TD0Estimator, TDLambdaEstimator
+from torchrl.testing import get_default_devices
 
 from torchrl_safe.objectives.value import RetraceEstimator, retrace_lambda_return_estimate
 
@@ -219,9 +234,16 @@ def test_params_and_target_params() -> None:
         torch.testing.assert_close(out, reference(data, action_value=smallest))
 
 
-@pytest.mark.parametrize(
-    "chunks", [{"value_chunk_size": 2}, {"num_chunks": 3}, {"num_chunks": 3, "value_chunk_dim": 1}]
-)
+CHUNKS = [
+    {"value_chunk_size": 2},
+    {"num_chunks": 3},
+    {"num_chunk": 3},
+    {"value_chunk_size": 3, "value_chunk_dim": 1},
+    {"num_chunks": 3, "value_chunk_dim": 1},
+]
+
+
+@pytest.mark.parametrize("chunks", CHUNKS)
 def test_chunks(chunks: dict[str, int]) -> None:
     data = make_precomputed(5, 7).exclude("state_action_value")
     critic = make_critic()
@@ -236,6 +258,46 @@ def test_chunks(chunks: dict[str, int]) -> None:
     dim = chunks.get("value_chunk_dim", 0)
     assert len(sizes) == 3
     assert sum(size[dim] for size in sizes) == data.shape[dim]
+
+
+@pytest.mark.parametrize("chunks", CHUNKS)
+@pytest.mark.parametrize("deactivate_vmap", [False, True])
+@pytest.mark.parametrize("call", ["forward", "shifted", "ensemble", "value_estimate"])
+def test_chunks_everywhere(call: str, deactivate_vmap: bool, chunks: dict[str, int]) -> None:
+    data, actor = make_data(4, 5), make_actor()
+    critics = [make_critic() for _ in range(2)]
+    params = torch.stack([TensorDict.from_module(critic).detach() for critic in critics])
+    results = []
+    for extra in ({}, chunks):
+        estimator = RetraceEstimator(
+            gamma=GAMMA,
+            lmbda=LMBDA,
+            actor_network=actor,
+            qvalue_network=critics[0],
+            shifted=call == "shifted",
+            deactivate_vmap=deactivate_vmap,
+            **extra,
+        )
+        torch.manual_seed(1)
+        if call == "value_estimate":
+            results.append(estimator.value_estimate(data, target_params=params))
+        elif call == "ensemble":
+            out = estimator(data.copy(), params=params, target_params=params.flip(0))
+            results.append(out["advantage"])
+        else:
+            results.append(estimator(data.copy())["advantage"])
+    torch.testing.assert_close(*results)
+
+
+def test_chunk_settings_exclude_each_other() -> None:
+    settings = {"gamma": GAMMA, "lmbda": LMBDA, "qvalue_network": make_critic()}
+    with pytest.raises(ValueError, match="value_chunk_size and num_chunks"):
+        RetraceEstimator(**settings, value_chunk_size=3, num_chunks=2)
+    with pytest.raises(ValueError, match="num_chunks and num_chunk"):
+        RetraceEstimator(**settings, num_chunk=3, num_chunks=2)
+    estimator = RetraceEstimator(**settings, num_chunks=2, value_chunk_dim=2)
+    with pytest.raises(ValueError, match="value_chunk_dim"):
+        estimator(make_precomputed(4, 7))
 
 
 def test_next_value_argument() -> None:
@@ -650,6 +712,249 @@ def test_shifted(truncations: int, budget: int, kept: int) -> None:
         short = RetraceEstimator(**settings)(data[:kept].copy())
         torch.testing.assert_close(out["value_target"][:kept], short["value_target"])
         assert not out["value_target"][kept:].any()
+
+
+def make_rows() -> TensorDict:
+    """Rows of 8 steps with two truncations, two terminations, none, and one of each."""
+    rows = torch.stack([make_shifted_data(2), *(make_shifted_data(0) for _ in range(2))])
+    rows = torch.cat([rows, make_shifted_data(1)[None]])
+    done, terminated = rows["next", "done"], rows["next", "terminated"]
+    done[1, [2, 4]] = terminated[1, [2, 4]] = True
+    done[3, 5] = terminated[3, 5] = True
+    return rows
+
+
+@pytest.mark.parametrize("time_dim", [0, 1])
+@pytest.mark.parametrize("budget", [1, 2, 3])
+def test_shifted_rows(budget: int, time_dim: int) -> None:
+    """Only truncations use up the budget, row by row; what is kept is as without."""
+    data, actor = make_rows(), make_actor()
+    critic = ValueOperator(StateCritic(), in_keys=["observation", "action"])
+    settings = {"gamma": GAMMA, "lmbda": LMBDA, "actor_network": actor, "qvalue_network": critic}
+    lost = torch.tensor([2, 0, 0, 1]) + 1 - budget
+    lost = lost.where(torch.tensor([True, False, False, True]), 0).clamp_min(0)
+    valid = torch.zeros(4, 8, dtype=torch.bool)
+    short = data.copy()
+    for row, number in enumerate(lost.tolist()):
+        valid[row, : 8 - number] = True
+        if number:
+            # The last step that fits ends a slice.
+            short["next", "done"] = short["next", "done"].clone()
+            short["next", "done"][row, 7 - number] = True
+    expected = RetraceEstimator(**settings)(short)
+    estimator = RetraceEstimator(**settings, shifted=True, shifted_budget=budget)
+    rows = data.copy()
+    if time_dim == 0:
+        rows = rows.transpose(0, 1)
+        assert not rows["observation"].is_contiguous()
+        rows.names = ["time", None]
+    out = estimator(rows)
+    out = out.transpose(0, 1) if time_dim == 0 else out
+    assert out["shifted_valid"].equal(valid)
+    for key in ("advantage", "value_target"):
+        torch.testing.assert_close(out[key][valid], expected[key][valid])
+        assert not out[key][~valid].any()
+
+
+def test_shifted_mask_is_that_of_the_call() -> None:
+    critic = ValueOperator(StateCritic(), in_keys=["observation", "action"])
+    estimator = RetraceEstimator(
+        gamma=GAMMA, lmbda=LMBDA, actor_network=make_actor(), qvalue_network=critic, shifted=True
+    )
+    assert not estimator(make_shifted_data(2))["shifted_valid"].all()
+    assert estimator(make_shifted_data(0))["shifted_valid"].all()
+
+
+def test_shifted_without_next_observations() -> None:
+    """The states of a rollout are enough, but for one beyond its end."""
+    data, actor = make_shifted_data(0), make_actor()
+    data["next", "done"][[2, 7]] = data["next", "terminated"][[2, 7]] = True
+    critic = ValueOperator(StateCritic(), in_keys=["observation", "action"])
+    settings = {"gamma": GAMMA, "lmbda": LMBDA, "actor_network": actor, "qvalue_network": critic}
+    expected = RetraceEstimator(**settings)(data.copy())
+    del data["next", "observation"]
+    out = RetraceEstimator(**settings, shifted=True)(data)
+    assert ("next", "observation") not in data.keys(True)
+    torch.testing.assert_close(out["value_target"], expected["value_target"])
+    torch.testing.assert_close(out["advantage"], expected["advantage"])
+
+
+@pytest.mark.parametrize("networks", ["actor and critic", "value", "discrete"])
+@pytest.mark.parametrize("shifted", [False, True])
+def test_next_observations_that_are_nan(networks: str, shifted: bool) -> None:
+    """What a compact collector leaves at the end: never read if terminal, else the state before."""
+    if networks == "value" and shifted:
+        pytest.skip("shifted takes no value_network")
+    data = make_shifted_data(0)
+    data["next", "done"][[3, 7]] = True
+    data["next", "terminated"][3] = True
+    if networks == "value":
+        data["policy_log_prob"], data["state_action_value"] = torch.randn(8), torch.randn(8, 1)
+        value = ValueOperator(MLP(OBS, 1, num_cells=[8]), in_keys=["observation"])
+        chosen = {"value_network": value}
+    elif networks == "discrete":
+        actor, critic = make_discrete("categorical")
+        data["action"] = torch.randint(NUM_ACTIONS, (8,))
+        chosen = {"actor_network": actor, "qvalue_network": critic, "action_space": "categorical"}
+    else:
+        critic = ValueOperator(StateCritic(), in_keys=["observation", "action"])
+        chosen = {"actor_network": make_actor(), "qvalue_network": critic}
+    estimator = RetraceEstimator(gamma=GAMMA, lmbda=LMBDA, **chosen, shifted=shifted)
+    data["next", "observation"][7] = data["observation"][7]
+    expected = estimator(data.copy())
+    data["next", "observation"][[3, 7]] = float("nan")
+    out = estimator(data.copy())
+    for key in ("advantage", "value_target"):
+        torch.testing.assert_close(out[key], expected[key])
+    torch.testing.assert_close(out["value_target"][3], data["next", "reward"][3])
+    assert data["next", "observation"][[3, 7]].isnan().all()
+    if not shifted:
+        target = estimator.value_estimate(data)
+        torch.testing.assert_close(target, expected["value_target"])
+
+
+@pytest.mark.parametrize("module", ["lstm", "gru"])
+def test_recurrent_networks(module: str) -> None:
+    """Over whole sequences as step by step, with or without a second pass over the states."""
+    hidden, batch, steps = 5, 2, 8
+    states = ["h", "c"] if module == "lstm" else ["h"]
+    make = LSTMModule if module == "lstm" else GRUModule
+    core = make(
+        input_size=OBS,
+        hidden_size=hidden,
+        in_keys=["observation", *states],
+        out_keys=["features", *(("next", name) for name in states)],
+        python_based=True,
+    )
+    critic = TensorDictSequential(
+        core,
+        TensorDictModule(
+            nn.Linear(hidden, NUM_ACTIONS), in_keys=["features"], out_keys=["action_value"]
+        ),
+    )
+    actor, _ = make_discrete("categorical")
+    data = torch.stack([make_shifted_data(0) for _ in range(batch)])
+    data["action"] = torch.randint(NUM_ACTIONS, (batch, steps))
+    data["next", "done"][0, 3] = True
+    init = torch.zeros(batch, steps + 1, 1, dtype=torch.bool)
+    init[:, 0] = init[0, 4] = True
+    data["is_init"], data["next", "is_init"] = init[:, :-1], torch.zeros_like(init[:, 1:])
+    # Step by step, as a collector would; the value of the next state goes on from its own state.
+    values, next_values = [], []
+    state = {name: torch.zeros(batch, 1, hidden) for name in states}
+    with torch.no_grad():
+        for t in range(steps):
+            step = TensorDict({"observation": data["observation"][:, t], **state}, [batch])
+            step["is_init"] = init[:, t]
+            state = {k: x.masked_fill(init[:, t, :, None], 0) for k, x in state.items()}
+            for name in states:
+                data.set(name, torch.zeros(batch, steps, 1, hidden)) if t == 0 else None
+                data[name][:, t] = state[name]
+            out = critic(step)
+            values.append(out["action_value"])
+            state = {name: out["next", name] for name in states}
+            following = TensorDict({**state, "is_init": torch.zeros(batch, 1, dtype=bool)}, [batch])
+            following["observation"] = data["next", "observation"][:, t]
+            for name in states:
+                if t == 0:
+                    data["next", name] = torch.zeros(batch, steps, 1, hidden)
+                data["next", name][:, t] = state[name]
+            next_values.append(critic(following)["action_value"])
+        prob = actor.module[0].module(data["next", "observation"]).softmax(-1)
+        log_prob = actor.module[0].module(data["observation"]).log_softmax(-1)
+    index = data["action"].unsqueeze(-1)
+    expected = reference(
+        data,
+        log_pi=log_prob.gather(-1, index),
+        action_value=torch.stack(values, 1).gather(-1, index),
+        next_state_value=(prob * torch.stack(next_values, 1)).sum(-1, keepdim=True),
+    )
+    for shifted in (False, True):
+        estimator = RetraceEstimator(
+            gamma=GAMMA,
+            lmbda=LMBDA,
+            actor_network=actor,
+            qvalue_network=critic,
+            action_space="categorical",
+            shifted=shifted,
+            shifted_budget=2,
+        )
+        with set_recurrent_mode(True):
+            out = estimator(data.copy())
+        torch.testing.assert_close(out["value_target"], expected, rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize("shifted", [False, True])
+@pytest.mark.parametrize("skip_existing", [None, False, True])
+@pytest.mark.parametrize("has_networks", [False, True])
+def test_skip_existing_shifted(has_networks: bool, skip_existing, shifted: bool) -> None:
+    data = make_shifted_data(0)
+    existing = make_precomputed(8).select("policy_log_prob", "state_action_value")
+    data.update(existing)
+    data["next", "state_value"] = torch.randn(8, 1)
+    networks = {}
+    if has_networks:
+        critic = ValueOperator(StateCritic(), in_keys=["observation", "action"])
+        networks = {"actor_network": make_actor(), "qvalue_network": critic}
+    estimator = RetraceEstimator(
+        gamma=GAMMA, lmbda=LMBDA, **networks, shifted=shifted, skip_existing=skip_existing
+    )
+    target = estimator(data.copy())["value_target"]
+    uses_existing = skip_existing or not has_networks
+    assert torch.allclose(target, reference(data)) is bool(uses_existing)
+
+
+@pytest.mark.parametrize("shifted", [False, True])
+@pytest.mark.parametrize("named", [False, True])
+def test_time_dim_with_networks(named: bool, shifted: bool) -> None:
+    data = torch.stack([make_shifted_data(0) for _ in range(3)])
+    critic = ValueOperator(StateCritic(), in_keys=["observation", "action"])
+    settings = {"gamma": GAMMA, "lmbda": LMBDA, "actor_network": make_actor()}
+    settings |= {"qvalue_network": critic, "shifted": shifted}
+    expected = RetraceEstimator(**settings)(data.copy())
+    assert not expected["advantage"].requires_grad
+    first = data.transpose(0, 1)
+    if named:
+        first.names = ["time", None]
+    calls = [(RetraceEstimator(**settings, time_dim=0), {})]
+    calls.append((RetraceEstimator(**settings), {} if named else {"time_dim": 0}))
+    calls.append((RetraceEstimator(**settings, time_dim=1), {"time_dim": -2}))
+    for estimator, arguments in calls:
+        out = estimator(first.copy(), **arguments)
+        for key in ("advantage", "value_target"):
+            torch.testing.assert_close(out[key].transpose(0, 1), expected[key])
+
+
+@pytest.mark.parametrize("key", ["state_value", "v", ("critic", "v")])
+def test_key_of_the_value_network(key: str | tuple[str, str]) -> None:
+    data = make_precomputed(4, 7)
+    network = TensorDictModule(nn.Linear(OBS, 1), in_keys=["observation"], out_keys=[key])
+    estimator = RetraceEstimator(gamma=GAMMA, lmbda=LMBDA, value_network=network)
+    estimator.set_keys(value=key)
+    assert estimator.tensor_keys.value == key
+    next_value = network.module(data["next", "observation"]).detach()
+    expected = reference(data, next_state_value=next_value)
+    torch.testing.assert_close(estimator(data.copy())["value_target"], expected)
+
+
+@pytest.mark.parametrize("device", get_default_devices())
+@pytest.mark.parametrize("dtype", [torch.float, torch.double])
+def test_device_and_dtype(dtype: torch.dtype, device: torch.device) -> None:
+    data = make_data(4, 7).to(device)
+    data = data.apply(lambda x: x.to(dtype) if x.is_floating_point() else x)
+    networks = [net.to(device).to(dtype) for net in (make_actor(), make_critic())]
+    estimator = RetraceEstimator(
+        gamma=GAMMA,
+        lmbda=LMBDA,
+        actor_network=networks[0],
+        qvalue_network=networks[1],
+        device=device,
+    )
+    assert estimator.gamma.device.type == estimator.lmbda.device.type == torch.device(device).type
+    out = estimator(data)
+    for key in ("advantage", "value_target"):
+        assert out[key].dtype == dtype
+        assert out[key].device.type == torch.device(device).type
 
 
 def test_shifted_misuse() -> None:

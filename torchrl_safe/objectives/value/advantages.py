@@ -104,7 +104,7 @@ class RetraceEstimator(ValueEstimatorBase):
             ``T``. Truncations use up the budget; steps that no longer fit are zero in the outputs
             and false in ``"shifted_valid"``, see
             :class:`~torchrl.objectives.value.TDLambdaEstimator`. Not with ``target_params``, nor
-            in a loss. Defaults to ``False``.
+            in a loss. Without effect where no network is called. Defaults to ``False``.
         shifted_budget (int): number of states besides ``T``. Defaults to 1.
         device (torch.device, optional): device of ``gamma`` and ``lmbda``.
         time_dim (int, optional): dimension of time in the tensordict. Defaults to the one named
@@ -392,7 +392,7 @@ class RetraceEstimator(ValueEstimatorBase):
             )
         time_dim = self._get_time_dim(time_dim, tensordict)
         data, valid = tensordict, None
-        if self.shifted:
+        if self.shifted and self._computes(tensordict):
             if target_params is not None:
                 raise ValueError("shifted=True has one set of parameters; leave out target_params.")
             value, next_value, log_pi, valid = self._shifted_values(tensordict, params, time_dim)
@@ -489,6 +489,15 @@ class RetraceEstimator(ValueEstimatorBase):
             time_dim=time_dim,
         )
 
+    def _computes(self, tensordict: TensorDictBase) -> bool:
+        """Whether networks have anything to do."""
+        if self.actor_network is None and self.qvalue_network is None:
+            return self.value_network is not None
+        keys = self.tensor_keys
+        outputs = (keys.policy_log_prob, keys.state_action_value, ("next", keys.value))
+        present = (tensordict.get(unravel_key(key), None) is not None for key in outputs)
+        return not (skip_existing() and all(present))
+
     def _policy_log_prob(self, tensordict: TensorDictBase) -> Tensor:
         key, actor = self.tensor_keys.policy_log_prob, self.actor_network
         has_density = hasattr(actor, "get_dist")
@@ -564,11 +573,11 @@ class RetraceEstimator(ValueEstimatorBase):
             )
         with torch.no_grad():
             if self.value_network is not None:
+                tensordict = _repair_next(tensordict, self.value_network.in_keys)
                 return self._next_value(tensordict, target_params, kwargs={})
-            next_tensordict = tensordict.get("next")
-            return self._expected_value(
-                self._policy(next_tensordict), next_tensordict, critic_params
-            )
+            in_keys = [*self.actor_network.in_keys, *self.qvalue_network.in_keys]
+            following = _repair_next(tensordict, in_keys).get("next")
+            return self._expected_value(self._policy(following), following, critic_params)
 
     def _expected_value(
         self, dist: Any, tensordict: TensorDictBase, params: TensorDictBase | None
@@ -606,7 +615,7 @@ class RetraceEstimator(ValueEstimatorBase):
 
         network = SimpleNamespace(in_keys=list({*actor.in_keys, *critic.in_keys, action_key}))
         values, next_values, valid = self._call_value_net_shifted(
-            tensordict,
+            _repair_next(tensordict, network.in_keys),
             params=None,
             next_params=None,
             value_key=self.tensor_keys.value,
@@ -676,6 +685,25 @@ def _select(tensordict: TensorDictBase, module: TensorDictModule, name: str) -> 
     for key in module.in_keys:
         _get(tensordict, key, f"an input of {name}")
     return tensordict.select(*module.in_keys)
+
+
+def _repair_next(tensordict: TensorDictBase, keys: list[NestedKey]) -> TensorDictBase:
+    """Next states that networks can take, in a shallow copy.
+
+    Collectors with ``compact_obs`` leave NaN at the end of a trajectory; the state before it takes
+    its place. A recurrent network starts anew where the trajectory does.
+    """
+    tensordict = tensordict.copy()
+    for key in keys:
+        next_key = unravel_key(("next", key))
+        value, following = tensordict.get(key, None), tensordict.get(next_key, None)
+        if value is None or following is None or value.shape != following.shape:
+            continue
+        if key == "is_init":
+            tensordict.set(next_key, value | following)
+        elif following.is_floating_point():
+            tensordict.set(next_key, torch.where(following.isnan(), value, following))
+    return tensordict
 
 
 def _with_feature(tensor: Tensor, tensordict: TensorDictBase) -> Tensor:

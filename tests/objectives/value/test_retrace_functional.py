@@ -11,6 +11,7 @@ from torchrl.objectives.value.functional import (
     td_lambda_return_estimate,
     vec_td_lambda_return_estimate,
 )
+from torchrl.testing import get_default_devices
 
 from torchrl_safe.objectives.value import (
     importance_sampling_lambda_return_estimate,
@@ -112,6 +113,93 @@ def test_definition(batch: tuple[int, ...], features: int, steps: int, vectorize
     inputs = make_inputs(*batch, steps=steps, features=features, seed=steps)
     target = retrace_lambda_return_estimate(GAMMA, LMBDA, **inputs, vectorized=vectorized)
     torch.testing.assert_close(target, by_definition(GAMMA, LMBDA, *inputs.values()))
+
+
+def by_loop(gamma, lmbda, inputs: dict[str, Tensor]) -> Tensor:
+    """One backward pass over time; the definition without its double sum."""
+    x = {name: tensor.movedim(-2, 0) for name, tensor in inputs.items()}
+    gamma = torch.as_tensor(gamma).to(x["reward"]).expand(inputs["reward"].shape).movedim(-2, 0)
+    target, following = [], None
+    for t in reversed(range(len(x["reward"]))):
+        value = x["reward"][t] + gamma[t] * x["next_state_value"][t].masked_fill(
+            x["terminated"][t], 0
+        )
+        if following is not None:
+            trace = lmbda * (x["log_pi"][t + 1] - x["log_mu"][t + 1]).exp().clamp_max(1)
+            ahead = gamma[t] * trace * (following - x["action_value"][t + 1])
+            value = value + ahead.masked_fill(x["done"][t], 0)
+        target.append(value)
+        following = value
+    return torch.stack(target[::-1], -2)
+
+
+@pytest.mark.parametrize("device", get_default_devices())
+@pytest.mark.parametrize("gamma", [0.1, 0.5, 0.99])
+@pytest.mark.parametrize("lmbda", [0.1, 0.99])
+@pytest.mark.parametrize("batch", [(1,), (3,), (7, 3)])
+@pytest.mark.parametrize(("steps", "features"), [(200, 1), (5, 2), (3, 5)])
+@pytest.mark.parametrize("dtype", [torch.float, torch.double])
+@pytest.mark.parametrize("has_done", [False, True])
+def test_grid(gamma, lmbda, batch, steps, features, dtype, has_done, device) -> None:
+    inputs = make_inputs(*batch, steps=steps, features=features, dtype=dtype)
+    inputs = {name: tensor.to(device) for name, tensor in inputs.items()}
+    if not has_done:
+        inputs["done"][:] = inputs["terminated"][:] = False
+    expected = by_loop(gamma, lmbda, inputs)
+    for vectorized in (True, False):
+        target = retrace_lambda_return_estimate(gamma, lmbda, **inputs, vectorized=vectorized)
+        assert target.dtype == dtype
+        torch.testing.assert_close(target, expected, rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.parametrize("shape", ["number", "element", "step", "batch", "feature"])
+@pytest.mark.parametrize("steps", [3, 50])
+@pytest.mark.parametrize("has_done", [False, True])
+def test_discounts_of_any_shape(has_done: bool, steps: int, shape: str) -> None:
+    inputs = make_inputs(7, 3, steps=steps, features=2)
+    if not has_done:
+        inputs["done"][:] = inputs["terminated"][:] = False
+    sizes = {
+        "number": (),
+        "element": (1,),
+        "step": (7, 3, steps, 1),
+        "batch": (7, 1, 1, 1),
+        "feature": (7, 3, steps, 2),
+    }
+    gamma = torch.rand(sizes[shape], dtype=torch.float64)
+    expected = by_loop(gamma, LMBDA, inputs)
+    for vectorized in (True, False):
+        target = retrace_lambda_return_estimate(gamma, LMBDA, **inputs, vectorized=vectorized)
+        torch.testing.assert_close(target, expected)
+
+
+@pytest.mark.parametrize("estimate", COEFFICIENTS, ids=lambda estimate: estimate.__name__)
+@pytest.mark.parametrize("steps", [4, 200])
+@pytest.mark.parametrize("batch", [(3,), (3, 7)])
+def test_successive_trajectories(estimate, batch: tuple[int, ...], steps: int) -> None:
+    """Two trajectories end to end have the targets of each alone, terminated or not."""
+    inputs = make_inputs(*batch, steps=steps)
+    inputs["done"][..., steps // 2 - 1, :] = True
+    inputs = {n: x for n, x in inputs.items() if n not in IGNORED.get(estimate, [])}
+    halves = [
+        estimate(GAMMA, LMBDA, **{name: x[..., part, :] for name, x in inputs.items()})
+        for part in (slice(None, steps // 2), slice(steps // 2, None))
+    ]
+    for vectorized in (True, False):
+        whole = estimate(GAMMA, LMBDA, **inputs, vectorized=vectorized)
+        torch.testing.assert_close(whole, torch.cat(halves, -2))
+
+
+def test_arguments() -> None:
+    """Inputs by place or name; settings by name alone; dimensions of a batch around time."""
+    inputs = {name: x.movedim(-2, 2) for name, x in make_inputs(2, 3, 4, steps=20).items()}
+    by_name = retrace_lambda_return_estimate(gamma=GAMMA, lmbda=LMBDA, **inputs, time_dim=2)
+    values = inputs.values()
+    for time_dim in (2, -3):
+        target = retrace_lambda_return_estimate(GAMMA, LMBDA, *values, time_dim=time_dim)
+        torch.testing.assert_close(target, by_name)
+    with pytest.raises(TypeError, match="positional arguments"):
+        retrace_lambda_return_estimate(GAMMA, LMBDA, *values, True, 2)
 
 
 @pytest.mark.parametrize("lmbda", [0.0, 0.6, 1.0])

@@ -10,6 +10,7 @@ from scipy import stats
 from torch.distributions import constraints
 from torchrl.modules import TanhNormal
 from torchrl.modules.distributions.utils import has_analytic_entropy
+from torchrl.testing import get_default_devices
 
 from torchrl_safe.modules import TanhGaussianMixture, mixture_moments
 
@@ -464,6 +465,69 @@ class TestTransforms:
 
 
 class TestInterface:
+    @pytest.mark.parametrize("device", get_default_devices())
+    @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+    @pytest.mark.parametrize("relaxation", RELAXATIONS)
+    @pytest.mark.parametrize("sample_shape", [(), (5,), (5, 2)])
+    @pytest.mark.parametrize("batch", [(), (3,), (3, 4)])
+    def test_shapes(self, batch, sample_shape, relaxation, dtype, device):
+        """Every draw and score has TorchRL's shapes, type and device, and scores itself."""
+        parameters = [p.to(device) for p in random_parameters(*batch, dtype=dtype)]
+        dist = TanhGaussianMixture(*parameters, relaxation=relaxation, low=-2.0, high=0.5)
+        assert (dist.batch_shape, dist.event_shape) == (batch, (2,))
+        draws = [dist.sample_and_log_prob(sample_shape), dist.rsample_and_log_prob(sample_shape)]
+        for action in (dist.sample(sample_shape), dist.rsample(sample_shape)):
+            draws.append((action, dist.log_prob(action)))
+        draws.append((dist.deterministic_sample, dist.log_prob(dist.deterministic_sample)))
+        for action, score in draws:
+            assert action.dtype == score.dtype == dtype
+            assert action.device.type == score.device.type == torch.device(device).type
+            assert dist.support.check(action).all()
+            torch.testing.assert_close(score, dist.log_prob(action), rtol=2e-3, atol=2e-3)
+        for action, score in draws[:-1]:
+            assert action.shape == (*sample_shape, *batch, 2)
+            assert score.shape == (*sample_shape, *batch)
+        assert draws[-1][0].shape == (*batch, 2)
+
+    @pytest.mark.parametrize("relaxation", RELAXATIONS)
+    def test_compiles_without_a_break(self, relaxation):
+        parameters = random_parameters(4)
+
+        def draw(noise, logits, loc, scale):
+            dist = TanhGaussianMixture(logits, loc, scale, relaxation=relaxation)
+            return dist.rsample_and_log_prob(noise=noise)
+
+        noise = TanhGaussianMixture(*parameters, relaxation=relaxation).draw_noise()
+        expected = draw(noise, *parameters)
+        compiled = torch.compile(draw, backend="eager", fullgraph=True)(noise, *parameters)
+        torch.testing.assert_close(compiled, expected)
+
+    def test_draws_compile_without_a_break(self):
+        @torch.compile(backend="eager", fullgraph=True)
+        def draw(logits, loc, scale):
+            dist = TanhGaussianMixture(logits, loc, scale)
+            return *dist.sample_and_log_prob(), dist.log_prob(dist.sample())
+
+        action, score, _ = draw(*random_parameters(4))
+        dist = TanhGaussianMixture(*random_parameters(4))
+        torch.testing.assert_close(score, dist.log_prob(action))
+
+    @pytest.mark.parametrize("relaxation", RELAXATIONS)
+    def test_vmap_draws_apart(self, relaxation):
+        """Over an ensemble, with other noise for each member or the same, as vmap is told."""
+        parameters = random_parameters(3, dtype=torch.float64)
+
+        def draw(logits, loc, scale):
+            dist = TanhGaussianMixture(logits, loc, scale, relaxation=relaxation)
+            return dist.rsample_and_log_prob()
+
+        same = [p[:1].expand_as(p) for p in parameters]
+        for randomness in ("same", "different"):
+            action, score = torch.vmap(draw, randomness=randomness)(*same)
+            dist = TanhGaussianMixture(*same)
+            torch.testing.assert_close(score, dist.log_prob(action))
+            assert torch.equal(action[0], action[1]) is (randomness == "same")
+
     def test_expand(self):
         low = torch.tensor([-2.0, -1.0]).double()
         dist = TanhGaussianMixture(

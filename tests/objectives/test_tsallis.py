@@ -9,8 +9,10 @@ from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torch import nn
 from torchrl.data import Bounded, Composite, MultiStep
+from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.modules import MLP, NormalParamExtractor, ProbabilisticActor, TanhNormal, ValueOperator
 from torchrl.objectives import SACLoss, SoftUpdate, ValueEstimators
+from torchrl.testing import get_default_devices
 
 from torchrl_safe import GMMTanhPolicy, TsallisLoss
 from torchrl_safe.modules import GMMParamExtractor
@@ -416,6 +418,126 @@ class TestLossModule:
         data["value_target"] = loss.compute_target(data)
         compiled = torch.compile(lambda td: loss.qvalue_v2_loss(td)[0], backend="eager")
         torch.testing.assert_close(compiled(data), loss.qvalue_v2_loss(data)[0])
+
+
+class TestAsUpstreamAsksOfALoss:
+    """What TorchRL's tests ask of each of its losses, beyond equality with SAC."""
+
+    OUT = ("loss_actor", "loss_qvalue", "loss_alpha", "alpha", "entropy")
+
+    @pytest.mark.parametrize("chosen", [("loss_actor",), ("loss_qvalue", "loss_alpha"), OUT])
+    def test_keys_in_and_out(self, blocks, chosen):
+        loss, data = TsallisLoss(*blocks, delay_qvalue=False), make_data()
+        assert set(loss.out_keys) == set(self.OUT)
+        inputs = {key if isinstance(key, str) else "_".join(key): data[key] for key in loss.in_keys}
+        assert set(data.select(*loss.in_keys).keys(True, True)) == set(loss.in_keys)
+        torch.manual_seed(1)
+        expected = loss(data.select(*loss.in_keys))
+        torch.manual_seed(1)
+        outputs = loss.select_out_keys(*chosen)(**inputs)
+        outputs = outputs if isinstance(outputs, tuple) else (outputs,)
+        for name, value in zip(chosen, outputs, strict=True):
+            torch.testing.assert_close(value, expected[name])
+
+    @pytest.mark.parametrize("reduction", ["mean", "sum", "none"])
+    def test_reduction(self, blocks, reduction):
+        """The mean and the sum are those of the terms that "none" leaves apart."""
+        exclude = {"scalar_output_mode": "exclude"} if reduction == "none" else {}
+        apart = TsallisLoss(
+            *blocks, delay_qvalue=False, reduction="none", scalar_output_mode="exclude"
+        )
+        loss = TsallisLoss(*blocks, delay_qvalue=False, reduction=reduction, **exclude)
+        loss.load_state_dict(apart.state_dict())
+        outs = []
+        for each in (apart, loss):
+            torch.manual_seed(1)
+            outs.append(each(make_data()))
+        for name in ("loss_actor", "loss_qvalue", "loss_alpha"):
+            expected = outs[0][name]
+            assert expected.shape == (8,)
+            if reduction != "none":
+                expected = getattr(expected, reduction)()
+            torch.testing.assert_close(outs[1][name], expected)
+
+    @pytest.mark.parametrize("kind", list(ExplorationType))
+    def test_draws_whatever_the_exploration_type(self, blocks, kind):
+        """The loss is an expectation over actions: the caller's mode does not turn it off."""
+        loss = TsallisLoss(*blocks, delay_qvalue=False)
+        outs = []
+        for _ in range(2):
+            with set_exploration_type(kind):
+                outs.append(loss(make_data()))
+        for name in ("loss_actor", "loss_qvalue"):
+            assert abs(outs[0][name] - outs[1][name]) > 1e-6
+        torch.manual_seed(1)
+        expected = loss(make_data())
+        torch.manual_seed(1)
+        with set_exploration_type(kind):
+            torch.testing.assert_close(loss(make_data()), expected)
+
+    def test_members_draw_apart_under_vmap(self, blocks):
+        """A random layer of the critics is drawn anew for each of them, without an error."""
+        net = nn.Sequential(nn.Linear(OBS + ACT, 64), nn.Dropout(0.5), nn.Linear(64, 1)).double()
+        critic = ValueOperator(_Concatenated(net), in_keys=["observation", "action"])
+        loss = TsallisLoss(blocks[0], critic, num_qvalue_nets=2, delay_qvalue=False)
+        twin = loss.qvalue_network_params.data
+        twin.apply_(lambda x: x.copy_(x[:1].expand_as(x)))  # the same weights in both
+        values = loss._vmap_qnetworkN0(make_data(), loss.qvalue_network_params)
+        first, second = values["state_action_value"]
+        assert not torch.allclose(first, second)
+
+    @pytest.mark.parametrize("delay_actor", [False, True])
+    @pytest.mark.parametrize("delay_qvalue", [False, True])
+    def test_target_parameters(self, blocks, delay_qvalue, delay_actor):
+        loss = TsallisLoss(*blocks, delay_qvalue=delay_qvalue, delay_actor=delay_actor)
+        delayed = {"actor_network": delay_actor, "qvalue_network": delay_qvalue}
+        updater = SoftUpdate(loss, eps=0.75) if delay_actor or delay_qvalue else None
+        trained = {id(p) for p in loss.parameters()}
+        for name, is_delayed in delayed.items():
+            own, target = (getattr(loss, f"{kind}{name}_params") for kind in ("", "target_"))
+            for old, new in zip(own.values(True, True), target.values(True, True), strict=True):
+                assert id(old) in trained
+                assert id(new) not in trained
+                assert (old.data_ptr() != new.data_ptr()) is is_delayed
+        if updater is not None:
+            for parameter in loss.parameters():
+                parameter.data.add_(1.0)
+            updater.step()
+            for name, is_delayed in delayed.items():
+                own, target = (getattr(loss, f"{kind}{name}_params") for kind in ("", "target_"))
+                for new, old in zip(target.values(True, True), own.values(True, True), strict=True):
+                    torch.testing.assert_close(new, old.data - (0.75 if is_delayed else 0.0))
+
+    @pytest.mark.filterwarnings(
+        "ignore:.*inline_inbuilt_nn_modules:FutureWarning",
+        "ignore:.*autograd.Function:DeprecationWarning",
+    )
+    @pytest.mark.parametrize("term", ["actor_loss", "qvalue_v2_loss"])
+    def test_terms_compile_without_a_break(self, blocks, term):
+        loss = TsallisLoss(*blocks, delay_qvalue=False, fixed_alpha=True, deactivate_vmap=True)
+        data = make_data()
+        data["value_target"] = loss.compute_target(data)
+        method = getattr(loss, term)
+        compiled = torch.compile(lambda td: method(td)[0], backend="eager", fullgraph=True)
+        torch.manual_seed(1)
+        expected = method(data)[0]
+        torch.manual_seed(1)
+        torch.testing.assert_close(compiled(data), expected)
+
+    @pytest.mark.parametrize("device", get_default_devices())
+    def test_device(self, blocks, device):
+        loss = TsallisLoss(*blocks, delay_qvalue=False).to(device)
+        out = loss(make_data().to(device))
+        assert {value.device.type for value in out.values()} == {torch.device(device).type}
+
+
+class _Concatenated(nn.Module):
+    def __init__(self, net):
+        super().__init__()
+        self.net = net
+
+    def forward(self, *inputs):
+        return self.net(torch.cat(inputs, -1))
 
 
 class TestMisuse:

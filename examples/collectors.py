@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import signal
+import sys
 from collections.abc import Callable, Mapping
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -19,7 +21,7 @@ from torchrl.collectors import (
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType
 
-BACKENDS = ("single", "multi_sync", "multi_async")
+BACKENDS = ("single", "multi_sync", "multi_async", "ray")
 
 
 def make_collector(
@@ -36,6 +38,8 @@ def make_collector(
     * ``multi_sync``: in ``collector.num_workers`` processes, which wait during an update.
     * ``multi_async``: the same without waiting: an update sees the batch of one worker,
       ``[N / num_workers, T]``, begun before the update that came before it.
+    * ``ray``: as ``multi_sync``, in actors of the Ray cluster that ``RAY_ADDRESS`` or this machine
+      has, else of one started here. Its machines need this library, not the example's files.
 
     Call ``update_policy_weights_`` on it after every update.
 
@@ -76,6 +80,8 @@ def make_collector(
         return MultiSyncCollector(
             creators, policy, cat_results="stack", postproc=_joined, **options
         )
+    if backend == "ray":
+        return _ray_collector(creators, policy, options)
     return MultiAsyncCollector(creators, policy, **options)
 
 
@@ -101,6 +107,31 @@ class ResumableCollector(Collector):
         carrier = TensorDict(state_dict["carrier"], self._carrier.batch_size)
         self._carrier.update(carrier.clone(), inplace=False)
         self._traj_pool.load_state_dict(state_dict["collector"]["traj_pool"])
+
+
+def _ray_collector(
+    creators: list[Callable[[], EnvBase]],
+    policy: Callable[[TensorDictBase], TensorDictBase],
+    options: dict[str, Any],
+) -> BaseCollector:
+    import ray
+    from torchrl.collectors.distributed import RayCollector
+
+    here = Path(__file__).parent
+    for module in list(sys.modules.values()):
+        if (path := getattr(module, "__file__", None)) and Path(path).parent == here:
+            ray.cloudpickle.register_pickle_by_value(module)
+    transforms = options.pop("auto_register_policy_transforms")
+    return RayCollector(
+        creators,
+        policy,
+        sync=True,
+        postproc=_joined,
+        collector_kwargs=[{"auto_register_policy_transforms": transforms} for _ in creators],
+        remote_configs={"num_cpus": 1},
+        ray_init_config={"include_dashboard": False},
+        **options,
+    )
 
 
 def worker_seed(seed: int, worker: int) -> int:

@@ -1,12 +1,14 @@
 from __future__ import annotations
 
+import os
 from functools import partial
 
 import pytest
 import torch
 from collectors import BACKENDS, make_collector, worker_seed
 from omegaconf import OmegaConf
-from torchrl.envs.utils import ExplorationType
+from tensordict.nn import TensorDictModule
+from torch import nn
 from torchrl.modules import MLP
 
 from torchrl_safe import GMMTanhPolicy
@@ -36,7 +38,7 @@ def policy():
     return GMMTanhPolicy(MLP(24, 5, num_cells=[16]), spec, num_components=1)
 
 
-def collect(cfg, policy, seed, batches, **kwargs):
+def collect(cfg, policy, seed, batches):
     """Batches, between which the policy changes, as an update would change it."""
     collector = make_collector(
         cfg,
@@ -44,8 +46,8 @@ def collect(cfg, policy, seed, batches, **kwargs):
         policy,
         seed=seed,
         total_frames=batches * cfg.collector.frames_per_batch,
-        **kwargs,
     )
+    collector.update_policy_weights_()
     weights = [param.detach().clone() for param in policy.parameters()]
     out = []
     for batch in collector:
@@ -57,14 +59,29 @@ def collect(cfg, policy, seed, batches, **kwargs):
     return out
 
 
+@pytest.fixture
+def cluster():
+    """Two workers on this machine; a slow one needs long to start."""
+    ray = pytest.importorskip("ray")
+    os.environ.setdefault("RAY_raylet_start_wait_time_s", "300")
+    ray.init(address="local", num_cpus=2, include_dashboard=False, object_store_memory=2**27)
+    yield
+    ray.shutdown()
+
+
 @pytest.mark.slow
-def test_workers_see_what_collectors_of_one_process_see(policy):
+@pytest.mark.parametrize("backend", ["multi_sync", "ray"])
+def test_workers_see_what_collectors_of_one_process_see(backend, request):
     """Each worker's rows are those of a single collector with its seed, weights up to date."""
-    greedy = {"exploration_type": ExplorationType.DETERMINISTIC}
-    together = collect(config("multi_sync"), policy, 5, 3, **greedy)
+    if backend == "ray":
+        request.getfixturevalue("cluster")
+    torch.manual_seed(0)
+    network = nn.Sequential(MLP(24, 2, num_cells=[16]), nn.Tanh())
+    policy = TensorDictModule(network, in_keys=["observation"], out_keys=["action"])
+    together = collect(config(backend), policy, 5, 3)
     apart = config("single", num_envs=3)
     apart.collector.frames_per_batch = FRAMES // 2
-    workers = [collect(apart, policy, worker_seed(5, i), 3, **greedy) for i in range(2)]
+    workers = [collect(apart, policy, worker_seed(5, i), 3) for i in range(2)]
     assert len(together) == 3
     for batch, *parts in zip(together, *workers, strict=True):
         assert batch.shape == (6, 20)

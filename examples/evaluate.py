@@ -14,6 +14,7 @@ import json
 from pathlib import Path
 
 import torch
+from checkpoints import load_component
 from critics import make_losses
 from omegaconf import DictConfig
 from tensordict import TensorDictBase
@@ -45,7 +46,7 @@ def load_cost_loss(
     if "variance_reward" not in cfg.loss:
         return None
     _, cost_loss = make_losses(cfg, env, policy)
-    Checkpoint(cost_loss=cost_loss).load(checkpoint)
+    load_component(checkpoint, "cost_loss", cost_loss)
     return cost_loss
 
 

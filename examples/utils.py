@@ -19,6 +19,7 @@ from types import FrameType
 from typing import Any
 
 import torch
+from checkpoints import adapter_of, latest, load_component, remove_leftovers, write_atomically
 from collectors import make_collector
 from config import check_config
 from omegaconf import DictConfig, OmegaConf
@@ -123,7 +124,7 @@ def train(
         partial(make_env, cfg, episode_length=cfg.env.episode_length, stagger=True),
         policy,
         seed=cfg.seed + run.frames,
-        total_frames=cfg.collector.total_frames - run.frames,
+        total_frames=max(1, run.frames_left),
     )
     if in_process:
         run.start(policy=policy, collector=collector)
@@ -136,7 +137,8 @@ def train(
     timeit.erase()  # what was timed before is not the run's
     started = time.perf_counter()
     with GracefulStop() as stop:
-        for batch in collector:
+        # None is left of a run that was killed in its final evaluation.
+        for batch in collector if run.frames_left else ():
             run.counters["frames"] += batch.numel()
             run.counters["total_cvs"] += count_violations(batch)
             metrics = batch_metrics(batch)
@@ -211,13 +213,16 @@ class Run:
         self.cfg = cfg
         self.path = Path(cfg.run_dir)
         self.counters = Counters(frames=0, total_cvs=0, seconds=0.0)
-        self.checkpoint = Checkpoint(counters=self.counters, random=GlobalRNGState(), **components)
+        self._saved: int | None = None  # frames of the newest checkpoint
+        self.checkpoint = Checkpoint()
+        self._register(counters=self.counters, random=GlobalRNGState(), **components)
         self.rotation = CheckpointRotation(
             self.path / "checkpoints", keep_last=cfg.checkpoint.keep_last
         )
-        if cfg.resume and self.rotation.latest() is None:
-            raise FileNotFoundError(f"run_dir={cfg.run_dir} has no checkpoint to resume from.")
-        if not cfg.resume and (self.path / "config.yaml").exists():
+        exists = (self.path / "config.yaml").exists()
+        if cfg.resume and not exists:
+            raise FileNotFoundError(f"run_dir={cfg.run_dir} holds no run to resume from.")
+        if exists and not cfg.resume:
             raise FileExistsError(
                 f"run_dir={cfg.run_dir} holds a run already: add resume=true to go on with it, or "
                 "choose another run_dir."
@@ -227,26 +232,31 @@ class Run:
         """Open the folder and the log, and go on from the newest checkpoint if asked to.
 
         Call it when everything is made: making things draws random numbers, and a resumed run goes
-        on with those that the checkpoint holds.
+        on with those that the checkpoint holds. A run that was killed before its first checkpoint
+        begins again.
 
         Args:
             **components: the last things that a checkpoint keeps.
 
         Raises:
-            ValueError: if the run to resume has all of its frames.
+            CheckpointError: if the checkpoint is not what was written, or could run code.
+            ValueError: if the run to resume has all of its frames and its results.
         """
         cfg = self.cfg
-        for name, component in components.items():
-            self.checkpoint.register(name, component)
+        self._register(**components)
         if cfg.resume:
-            self.rotation.load_latest(self.checkpoint)
-            if self.frames >= cfg.collector.total_frames:
+            remove_leftovers(self.path)
+            checkpoint = latest(self.path)
+            if checkpoint is not None:
+                self.checkpoint.load(checkpoint)
+                self._saved = self.frames
+            if not self.frames_left and (self.path / "results.json").exists():
                 raise ValueError(
                     f"collector.total_frames={cfg.collector.total_frames} leaves nothing to do: "
                     f"the run in run_dir={cfg.run_dir} has {self.frames} frames."
                 )
         self.path.mkdir(parents=True, exist_ok=True)
-        OmegaConf.save(cfg, self.path / "config.yaml", resolve=True)
+        write_atomically(self.path / "config.yaml", OmegaConf.to_yaml(cfg, resolve=True))
         os.environ.setdefault("WANDB_MODE", "offline")
         self.logger = get_logger(
             cfg.logger.backend,
@@ -260,14 +270,29 @@ class Run:
         """Frames collected so far."""
         return self.counters["frames"]
 
+    @property
+    def frames_left(self) -> int:
+        """Frames that the configuration still asks for."""
+        return max(0, self.cfg.collector.total_frames - self.frames)
+
+    def _register(self, **components: Any) -> None:
+        for name, component in components.items():
+            self.checkpoint.register(name, component, adapter=adapter_of(component))
+
     def log(self, metrics: Mapping[str, float]) -> None:
         """Write metrics at the current frame."""
         if self.logger is not None:
             self.logger.log_metrics(dict(metrics), step=self.frames)
 
     def save(self) -> None:
-        """Write a checkpoint; a crash while writing leaves the last one whole."""
-        self.rotation.save(self.checkpoint, step=self.frames)
+        """Write a checkpoint; a crash while writing leaves the last one whole.
+
+        Raises:
+            OSError: if the disk is full.
+        """
+        if self._saved != self.frames:  # to replace one by its like could lose both to a kill
+            self.rotation.save(self.checkpoint, step=self.frames)
+            self._saved = self.frames
 
     def evaluate(
         self, env: EnvBase, policy: Callable[[TensorDictBase], TensorDictBase]
@@ -305,7 +330,7 @@ class Run:
             "seconds": seconds,
             "frames_per_second": frames / seconds if seconds else 0.0,
         }
-        (self.path / "results.json").write_text(json.dumps(results, indent=2) + "\n")
+        write_atomically(self.path / "results.json", json.dumps(results, indent=2) + "\n")
         self.plot()
         rows = {
             f"score, deterministic ({env.batch_size.numel()} episodes)": metrics["eval/det/score"],
@@ -339,10 +364,11 @@ def load_policy(run_dir: str | os.PathLike[str]) -> GMMTanhPolicy:
 
     Raises:
         FileNotFoundError: if it holds no run, or one without a checkpoint.
+        CheckpointError: if the checkpoint is not what was written, or could run code.
     """
     cfg, checkpoint = load_run(run_dir)
     policy = make_policy(cfg, make_env(cfg, num_envs=1, seed=0))
-    Checkpoint(policy=policy).load(checkpoint)
+    load_component(checkpoint, "policy", policy)
     return policy.eval().requires_grad_(False)
 
 
@@ -351,11 +377,12 @@ def load_run(run_dir: str | os.PathLike[str]) -> tuple[DictConfig, Path]:
 
     Raises:
         FileNotFoundError: if the folder holds no run, or one without a checkpoint.
+        CheckpointError: if the newest checkpoint cannot be read.
     """
     path = Path(run_dir)
     if not (path / "config.yaml").exists():
         raise FileNotFoundError(f"run_dir={run_dir} holds no run: it has no config.yaml.")
-    checkpoint = CheckpointRotation(path / "checkpoints", keep_last=1).latest()
+    checkpoint = latest(path)
     if checkpoint is None:
         raise FileNotFoundError(f"run_dir={run_dir} has no checkpoint yet.")
     return OmegaConf.load(path / "config.yaml"), checkpoint

@@ -3,7 +3,8 @@
     python examples/run_exported.py runs/safetac_point/seed_0/policy.onnx
 
 Nothing of the policy's code is imported. The file maps observations ``[B, D]`` to actions
-``[B, A]``, float32; on a robot, the loop below is all there is.
+``[B, A]``, float32; on a robot, the loop below is all there is. A ``.pt2`` is a program that torch
+partly unpickles: take it from no one but yourself. An ``.onnx`` runs nothing but its own operators.
 """
 
 from __future__ import annotations

@@ -124,7 +124,7 @@ def train(
         partial(make_env, cfg, episode_length=cfg.env.episode_length, stagger=True),
         policy,
         seed=cfg.seed + run.frames,
-        total_frames=max(1, run.frames_left),
+        total_frames=run.frames_left or cfg.collector.frames_per_batch,
     )
     if in_process:
         run.start(policy=policy, collector=collector)

@@ -18,7 +18,6 @@ from checkpoints import load_component
 from critics import make_losses
 from omegaconf import DictConfig
 from tensordict import TensorDictBase
-from torchrl.checkpoint import Checkpoint
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from utils import load_policy, load_run, make_env
 

@@ -162,7 +162,7 @@ class TestResume:
             assert first[name] == second[name]
 
     def test_nothing_to_resume(self, tmp_path):
-        with pytest.raises(FileNotFoundError, match="has no checkpoint to resume from"):
+        with pytest.raises(FileNotFoundError, match="holds no run to resume from"):
             launch(tmp_path / "run", "resume=true")
         assert not (tmp_path / "run").exists()
 

@@ -71,6 +71,29 @@ def bounds() -> Rule:
     )
 
 
+def stages() -> Rule:
+    """Stages of the cross-entropy method, each with the same entries."""
+    counts = ("num_directions", "population", "elites", "num_steps", "generations")
+
+    def holds(value: Any) -> bool:
+        return isinstance(value, list) and all(
+            isinstance(stage, Mapping)
+            and stage.keys() == {*counts, "std"}
+            and all(integer(1).holds(stage[name]) for name in counts)
+            and 2 <= stage["elites"] <= stage["population"]
+            and isinstance(stage["std"], list)
+            and len(stage["std"]) == 2
+            and all(number("[0, inf)").holds(std) for std in stage["std"])
+            for stage in value
+        )
+
+    return Rule(
+        holds,
+        f"a list of stages with {', '.join(counts)} (integers of at least 1; 2 to population "
+        "elites) and std (two numbers of at least 0)",
+    )
+
+
 def optional(rule: Rule) -> Rule:
     """As the rule says, or null."""
     return Rule(lambda v: v is None or rule.holds(v), f"null or {rule.text}")
@@ -90,6 +113,9 @@ RULES: dict[str, Rule] = {
     "env.robot": one_of(*ROBOTS),
     "env.num_envs": integer(1),
     "env.episode_length": integer(1),
+    "task.top_speed": number("(0, inf)"),
+    "task.tilt_cost": number("[0, inf)"),
+    "gait": stages(),
     "collector.backend": one_of(*BACKENDS),
     "collector.num_workers": integer(1),
     "collector.frames_per_batch": integer(1),
@@ -108,6 +134,7 @@ RULES: dict[str, Rule] = {
     "policy.relaxation": one_of("gumbel_softmax", "straight_through", "implicit"),
     "policy.temperature": number("(0, inf)"),
     "policy.log_std_bounds": bounds(),
+    "policy.init_std": number("(0, inf)"),
     "critic.num_cells": widths(),
     "loss.entropic_index": number("(0, inf)"),
     "loss.alpha": number("(0, inf)"),
@@ -121,6 +148,8 @@ RULES: dict[str, Rule] = {
     "loss.initial_cost_limit": number("[0, inf)"),
     "loss.anneal_frames": integer(0),
     "loss.variance_reward": one_of("td_error", "second_moment"),
+    "loss.clip_epsilon": number("(0, 1)"),
+    "loss.entropy_coeff": number("[0, inf)"),
     "lagrangian.policy_lr": number("(0, inf)"),
     "lagrangian.minibatch_size": integer(1),
     "lagrangian.init": number("(0, inf)"),
@@ -128,6 +157,7 @@ RULES: dict[str, Rule] = {
     "pid.kp": number("[0, inf)"),
     "pid.ki": number("(0, inf)"),
     "pid.kd": number("[0, inf)"),
+    "optim.num_epochs": integer(1),
     "optim.num_updates": integer(1),
     "optim.tau": number("(0, 1]"),
     "optim.lr": number("(0, inf)"),
@@ -151,6 +181,7 @@ RULES: dict[str, Rule] = {
     "eval.interval": integer(1),
     "eval.num_episodes": integer(1),
     "eval.final_episodes": integer(1),
+    "eval.num_directions": integer(1),
     "eval.num_steps": integer(1),
     "checkpoint.interval": integer(1),
     "checkpoint.keep_last": integer(1),

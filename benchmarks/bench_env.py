@@ -39,7 +39,9 @@ def mj_step(robot: Robot, num_envs: int, num_threads: int) -> Callable[[], objec
 
     def step() -> None:
         for data, action in zip(simulations, next(actions), strict=True):
-            data.ctrl = robot.control(action[None], data.qpos[None], data.qvel[None])[0]
+            data.ctrl = robot.control(
+                action[None], data.qpos[None], data.qvel[None], np.array([data.time])
+            )[0]
             mujoco.mj_step(model, data, nstep=robot.substeps)
 
     return step
@@ -51,10 +53,10 @@ def batch(robot: Robot, num_envs: int, num_threads: int) -> Callable[[], object]
     simulations = Batch(compiled_model(robot), num_envs, num_threads)
     qpos, qvel = simulations.bind("qpos"), simulations.bind("qvel")
     qpos[:] = robot.place(np.zeros((num_envs, 2)), np.zeros(num_envs))
-    ctrl = simulations.bind("ctrl")
+    time, ctrl = simulations.bind("time"), simulations.bind("ctrl")
 
     def step() -> None:
-        ctrl[:] = robot.control(next(actions), qpos, qvel)
+        ctrl[:] = robot.control(next(actions), qpos, qvel, time)
         simulations.step(nstep=robot.substeps)
 
     return step

@@ -26,8 +26,8 @@ class Walking:
     as it does under a policy that is still to learn where to go.
 
     The reward is in metres per second: ``wanted - |progress - wanted|`` along the command, less
-    ``tilt_cost`` times how much the trunk leans (1 minus the vertical). A robot that tips over is
-    a violation, and ends its episode.
+    ``tilt_cost`` times the square of how much the trunk leans (1 minus the vertical): swaying is
+    cheap, being about to fall is not. A robot that tips over is a violation, and ends its episode.
 
     Args:
         top_speed (float): metres per second that are wanted at most.
@@ -37,7 +37,7 @@ class Walking:
     """
 
     top_speed: float = 0.6
-    tilt_cost: float = 0.3
+    tilt_cost: float = 4.0
     num_directions: int | None = None
 
     max_cost = 1.0
@@ -88,7 +88,7 @@ class Walking:
         progress = (velocity * command).sum(1) / np.maximum(length, 1e-9)
         wanted = self.top_speed * length
         leaning = 1.0 - motion.proprioception[:, VERTICAL]
-        reward = wanted - np.abs(progress - wanted) - self.tilt_cost * leaning
+        reward = wanted - np.abs(progress - wanted) - self.tilt_cost * leaning**2
         if self.num_directions is None:
             rows = np.arange(len(command))
             renewed = streams.uniform(rows, 1) < 1.0 / objects["hold"][:, None]

@@ -39,7 +39,7 @@ class TestRegistration:
         assert observations in envs.observation_space
 
     def test_ids(self):
-        robots = ("Point", "Car", "DoggoTorques", "Jackal")
+        robots = ("Point", "Car", "Doggo", "DoggoTorques", "Jackal")
         registered = {name for name in gymnasium.registry if name.startswith("torchrl_safe/")}
         assert registered == {f"torchrl_safe/{robot}Goal-v0" for robot in robots}
 

@@ -323,7 +323,9 @@ class TestRobot:
         data = mujoco.MjData(model)
         rates = []
         for _ in range(60):
-            wheels = JACKAL.control(np.array([(-1.0, 1.0)]), data.qpos[None], data.qvel[None])[0]
+            wheels = JACKAL.control(
+                np.array([(-1.0, 1.0)]), data.qpos[None], data.qvel[None], np.array([data.time])
+            )[0]
             data.ctrl[:] = np.tile(wheels, 2)
             mujoco.mj_step(model, data, JACKAL.substeps)
             rates.append(data.qvel[5])

@@ -99,7 +99,7 @@ class TestPhysics:
             varied.step(action)
             for i, (model, data) in enumerate(datas):
                 qpos, qvel = data.qpos[None], data.qvel[None]
-                data.ctrl[:] = robot.control(action[[i]], qpos, qvel)[0]
+                data.ctrl[:] = robot.control(action[[i]], qpos, qvel, np.array([data.time]))[0]
                 mujoco.mj_step(model, data, robot.substeps)
                 # Point's stiff servo makes something of rounding.
                 np.testing.assert_allclose(varied.qpos(i), data.qpos, atol=1e-5)

@@ -80,6 +80,7 @@ class RobotBatch:
             self._batch = batch = Batch(self._model, self.num_envs, self.num_threads)
             self._initial = batch.state[0].copy()
             self._qpos, self._qvel = batch.bind("qpos"), batch.bind("qvel")
+            self._time = batch.bind("time")
             self._ctrl, self._qacc = batch.bind("ctrl"), batch.bind("qacc")
             if self.variation is not None:
                 self.vary(np.arange(self.num_envs), self.variation)
@@ -89,7 +90,7 @@ class RobotBatch:
         return self._batch
 
     def __getstate__(self) -> dict[str, Any]:
-        bound = ("_initial", "_qpos", "_qvel", "_ctrl", "_qacc")
+        bound = ("_initial", "_qpos", "_qvel", "_time", "_ctrl", "_qacc")
         kept = {name: value for name, value in self.__dict__.items() if name not in bound}
         saved = self._saved if self._batch is None else self._batch.state.copy()
         return kept | {"_batch": None, "_saved": saved}
@@ -133,7 +134,8 @@ class RobotBatch:
         """
         batch = self.batch
         before = batch.state.copy()
-        self._ctrl[:] = self._late(self.robot.control(action, self._qpos, self._qvel))
+        command = self.robot.control(action, self._qpos, self._qvel, self._time)
+        self._ctrl[:] = self._late(command)
         try:
             batch.step(nstep=self.robot.substeps)
             failed = np.zeros(self.num_envs, bool)

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+
+from torchrl_safe.envs.legs import controller_input, load_legs, torques
 
 Array = NDArray[np.float64]
 
@@ -50,7 +52,8 @@ class Robot:
         proprioception_scale (tuple of float): what each of the P proprioceptive readings is
             divided by in the observation.
         place (callable): ``(position [N, 2], yaw [N]) -> qpos [N, nq]``, the robot at rest there.
-        control (callable): ``(action [N, A], qpos [N, nq], qvel [N, nv]) -> ctrl [N, nu]``.
+        control (callable): ``(action [N, A], qpos [N, nq], qvel [N, nv], time [N]) -> ctrl [N, nu]``;
+            the time is that since the robot was placed, in seconds.
         sense (callable): ``(qpos [N, nq], qvel [N, nv], qacc [N, nv]) -> Motion``.
         task (str): the name of the task it does by default.
         footprint (tuple of float, optional): half the length and half the width in metres of the
@@ -69,7 +72,7 @@ class Robot:
     action_dim: int
     proprioception_scale: tuple[float, ...]
     place: Callable[[Array, Array], Array]
-    control: Callable[[Array, Array, Array], Array]
+    control: Callable[[Array, Array, Array, Array], Array]
     sense: Callable[[Array, Array, Array], Motion]
     task: str = "goal"
     footprint: tuple[float, float] | None = None
@@ -117,11 +120,11 @@ def _place_free(position: Array, yaw: Array, height: float, joints: tuple[float,
     return qpos
 
 
-def _control_directly(action: Array, qpos: Array, qvel: Array) -> Array:
+def _control_directly(action: Array, qpos: Array, qvel: Array, time: Array) -> Array:
     return action
 
 
-def _control_wheels(action: Array, qpos: Array, qvel: Array) -> Array:
+def _control_wheels(action: Array, qpos: Array, qvel: Array, time: Array) -> Array:
     """Wheel speeds (left, right), rad/s, for a velocity in [0, 1] m/s and a yaw rate in rad/s."""
     velocity, turn = (action[:, 0] + 1.0) / 2.0, action[:, 1] * (_JACKAL_TRACK / 2.0)
     return np.stack((velocity - turn, velocity + turn), 1) / _JACKAL_WHEEL_RADIUS
@@ -197,6 +200,13 @@ def _sense_joints(qpos: Array, qvel: Array, qacc: Array) -> Motion:
     return Motion(qpos[:, :2].copy(), _heading(rotation), np.concatenate(parts, 1))
 
 
+def _control_legs(action: Array, qpos: Array, qvel: Array, time: Array) -> Array:
+    """Torques for a command to walk: its direction in the robot's frame, and how fast."""
+    readings = _sense_joints(qpos, qvel, qvel).proprioception
+    legs = load_legs(_ASSETS / "doggo_legs.safetensors")
+    return torques(legs, controller_input(action, readings, time))
+
+
 _POINT = Robot(
     name="point",
     asset="point.xml",
@@ -253,7 +263,18 @@ _DOGGO_TORQUES = Robot(
     sense=_sense_joints,
 )
 
-ROBOTS: dict[str, Robot] = {robot.name: robot for robot in (_POINT, _CAR, _DOGGO_TORQUES, _JACKAL)}
+_DOGGO = replace(
+    _DOGGO_TORQUES,
+    name="doggo",
+    action_dim=2,
+    proprioception_scale=_CAR.proprioception_scale,
+    control=_control_legs,
+    sense=_sense_free,
+)
+
+ROBOTS: dict[str, Robot] = {
+    robot.name: robot for robot in (_POINT, _CAR, _DOGGO, _DOGGO_TORQUES, _JACKAL)
+}
 
 
 def get_robot(name: str) -> Robot:

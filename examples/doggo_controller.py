@@ -210,6 +210,8 @@ def main(cfg: DictConfig) -> None:
         auto_register_policy_transforms=False,
     )
     run.start(collector=collector)
+    if not cfg.resume:
+        export(legs, run.path / "gait.safetensors")  # to compare with
 
     total = cfg.collector.total_frames
     progress = tqdm(total=total, initial=run.frames, unit="frame")

@@ -27,7 +27,7 @@ MOTORS = [
 
 
 def walk(num_robots: int, num_steps: int, length: float = 1.0, threads: int = 2):
-    """Displacement along each robot's own way of the world [N], and whether it ever tipped [N]."""
+    """Displacement along each robot's own way [N]; has it ever tipped, has it at the end [N]."""
     env = SafeGoalEnv(
         "doggo", num_envs=num_robots, num_threads=threads, task=GoalTask(num_hazards=0), seed=3
     )
@@ -35,40 +35,42 @@ def walk(num_robots: int, num_steps: int, length: float = 1.0, threads: int = 2)
     qpos = env._core._robots.batch.bind("qpos")
     way = np.exp(2j * np.pi * np.arange(num_robots) / num_robots)
     start = qpos[:, :2].copy()
-    tipped = np.zeros(num_robots, bool)
+    ever = np.zeros(num_robots, bool)
     for _ in range(num_steps):
         w, x, y, z = qpos[:, 3:7].T
         heading = 1 - 2 * (y * y + z * z) + 2j * (x * y + w * z)
         local = length * way * heading.conj() / abs(heading)
         action = torch.from_numpy(np.stack((local.real, local.imag), 1)).float()
         env.step(TensorDict({"action": action}, [num_robots]))
-        tipped |= 1 - 2 * (qpos[:, 4] ** 2 + qpos[:, 5] ** 2) < 0.3
+        tipped = 1 - 2 * (qpos[:, 4] ** 2 + qpos[:, 5] ** 2) < 0.3
+        ever |= tipped
     moved = qpos[:, :2] - start
-    return moved[:, 0] * way.real + moved[:, 1] * way.imag, tipped
+    return moved[:, 0] * way.real + moved[:, 1] * way.imag, ever, tipped
 
 
 class TestWalking:
     def test_every_direction(self):
         """Sixteen ways, over 20 s, the turn included: faster than .15 m/s, on its legs."""
-        along, tipped = walk(16, 200)
+        along, ever, _ = walk(16, 200)
         assert (along / 20.0 > 0.15).all()
-        assert not tipped.any()
+        assert not ever.any()
 
     @pytest.mark.slow
     def test_a_whole_episode(self):
         """Sixty-four robots for 100 s."""
-        along, tipped = walk(64, 1000)
-        assert (along / 100.0 > 0.15).mean() >= 0.98
+        along, ever, tipped = walk(64, 1000)
+        assert (along / 100.0 > 0.15).all()
+        assert ever.mean() <= 0.05
         assert tipped.mean() <= 0.02
 
     def test_half_a_command_is_slower(self):
         fast, slow = (walk(16, 100, length)[0].mean() for length in (1.0, 0.5))
-        assert 0.1 * fast < slow < 0.8 * fast
+        assert 0.2 * fast < slow < 0.8 * fast
 
     def test_stands_without_a_command(self):
-        along, tipped = walk(4, 50, 0.0)
+        along, ever, _ = walk(4, 50, 0.0)
         assert abs(along).max() < 0.5
-        assert not tipped.any()
+        assert not ever.any()
 
     def test_threads(self):
         assert (walk(5, 30, threads=1)[0] == walk(5, 30, threads=2)[0]).all()
@@ -180,7 +182,9 @@ class TestController:
             turned = turned * (heading[:, 0] - 1j * heading[:, 1])
             qpos, qvel, time = (robots.batch.bind(key) for key in ("qpos", "qvel", "time"))
             expected = control(np.stack((turned.real, turned.imag), 1), qpos, qvel, time)
-            action = torques(legs, td["observation"].double().numpy())
+            seen = td["observation"].double().numpy()
+            seen[:, :2] *= 0.7  # of the full speed it was trained on
+            action = torques(legs, seen)
             np.testing.assert_allclose(action, expected, atol=1e-4)
             td["action"] = torch.from_numpy(action).float()
             td = by_motors.step(td)["next"]
@@ -198,6 +202,9 @@ class TestController:
         assert load_legs(ASSET).gait.shape == (6, 6)
 
     def test_long_commands_are_cut(self):
-        command = np.array([[1.0, 1.0], [0.3, -0.4]])
-        seen = controller_input(command, np.zeros((2, 45)), np.zeros(2))[:, :2]
-        np.testing.assert_allclose(seen, [[np.sqrt(0.5)] * 2, [0.3, -0.4]])
+        robot = get_robot("doggo")
+        qpos = robot.place(np.zeros((3, 2)), np.zeros(3))
+        action = np.array([[1.0, 1.0], [np.sqrt(0.5)] * 2, [0.5, 0.5]])
+        long, full, slow = robot.control(action, qpos, np.zeros((3, 19)), np.zeros(3))
+        np.testing.assert_allclose(long, full)
+        assert abs(full - slow).max() > 0.05

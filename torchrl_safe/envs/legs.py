@@ -61,17 +61,16 @@ def controller_input(command: Array, readings: Array, time: Array) -> Array:
     """What the controller sees.
 
     Args:
-        command (array): [N, 2], where to walk in the robot's frame, of length one for as fast as it
-            can. Longer ones are cut.
+        command (array): [N, 2], where to walk in the robot's frame; of length one at most, for as
+            fast as it can.
         readings (array): [N, 45], what ``doggo_torques`` senses.
         time (array): [N], seconds since the robot was put down.
 
     Returns:
         array: [N, 49].
     """
-    length = np.hypot(command[:, 0], command[:, 1])[:, None]
     clock = _CLOCK[np.rint(time / STEP).astype(np.intp) % len(_CLOCK)]
-    return np.concatenate((command / np.maximum(length, 1.0), readings / _SCALE, clock), 1)
+    return np.concatenate((command, readings / _SCALE, clock), 1)
 
 
 def gait_features(x: Array) -> Array:

@@ -20,6 +20,9 @@ _GRAVITY = 9.81
 
 # Doggo's driven joints, counted behind the free base; the waist, number 6, has no motor.
 _DOGGO_JOINTS = np.delete(np.arange(13), 6)
+# The fastest it is told to walk, as a share of what its controller was trained on: above, it falls
+# more often.
+_DOGGO_PACE = 0.7
 
 _JACKAL_WHEEL_RADIUS, _JACKAL_TRACK = 0.098, 0.376
 
@@ -52,8 +55,8 @@ class Robot:
         proprioception_scale (tuple of float): what each of the P proprioceptive readings is
             divided by in the observation.
         place (callable): ``(position [N, 2], yaw [N]) -> qpos [N, nq]``, the robot at rest there.
-        control (callable): ``(action [N, A], qpos [N, nq], qvel [N, nv], time [N]) -> ctrl [N, nu]``;
-            the time is that since the robot was placed, in seconds.
+        control (callable): ``(action [N, A], qpos [N, nq], qvel [N, nv], time [N]) ->
+            ctrl [N, nu]``; the time is in seconds since the robot was placed.
         sense (callable): ``(qpos [N, nq], qvel [N, nv], qacc [N, nv]) -> Motion``.
         task (str): the name of the task it does by default.
         footprint (tuple of float, optional): half the length and half the width in metres of the
@@ -200,11 +203,12 @@ def _sense_joints(qpos: Array, qvel: Array, qacc: Array) -> Motion:
     return Motion(qpos[:, :2].copy(), _heading(rotation), np.concatenate(parts, 1))
 
 
-def _control_legs(action: Array, qpos: Array, qvel: Array, time: Array) -> Array:
+def _control_legs(action: Array, qpos: Array, qvel: Array, time: Array, weights: Path) -> Array:
     """Torques for a command to walk: its direction in the robot's frame, and how fast."""
+    length = np.hypot(action[:, 0], action[:, 1])[:, None]
+    command = _DOGGO_PACE * action / np.maximum(length, 1.0)
     readings = _sense_joints(qpos, qvel, qvel).proprioception
-    legs = load_legs(_ASSETS / "doggo_legs.safetensors")
-    return torques(legs, controller_input(action, readings, time))
+    return torques(load_legs(weights), controller_input(command, readings, time))
 
 
 _POINT = Robot(
@@ -268,7 +272,7 @@ _DOGGO = replace(
     name="doggo",
     action_dim=2,
     proprioception_scale=_CAR.proprioception_scale,
-    control=_control_legs,
+    control=partial(_control_legs, weights=_ASSETS / "doggo_legs.safetensors"),
     sense=_sense_free,
 )
 

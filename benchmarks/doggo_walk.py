@@ -15,8 +15,7 @@ import numpy as np
 import torch
 from tensordict import TensorDict
 
-from torchrl_safe.envs import GoalTask, SafeGoalEnv
-from torchrl_safe.envs import Robot, get_robot
+from torchrl_safe.envs import GoalTask, Robot, SafeGoalEnv, get_robot
 from torchrl_safe.envs.robots import to_robot_frame
 
 STEP = 0.1  # seconds

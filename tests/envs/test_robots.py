@@ -259,7 +259,7 @@ def test_joint_readings_by_name():
             assert readings[i, 33 + k] == math.cos(qpos[i, joint.qposadr[0]])
 
 
-@pytest.mark.parametrize("name", ["car", "doggo_torques"])
+@pytest.mark.parametrize("name", ["car", "doggo", "doggo_torques"])
 class TestEnvironment:
     @staticmethod
     def drive(env: SafeGoalEnv, steps: int, seed: int = 0) -> TensorDict:
@@ -278,7 +278,7 @@ class TestEnvironment:
 
     def test_sizes(self, name):
         env = SafeGoalEnv(name, num_envs=2, num_threads=1)
-        sizes = {"car": (24, 2), "doggo_torques": (64, 12)}
+        sizes = {"car": (24, 2), "doggo": (24, 2), "doggo_torques": (64, 12)}
         assert env.observation_spec["observation"].shape == (2, sizes[name][0])
         assert env.action_spec.shape == (2, sizes[name][1])
 

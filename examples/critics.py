@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import torch
+from descent import Descent
 from omegaconf import DictConfig
 from tensordict import TensorDictBase
 from torch import nn
@@ -102,15 +103,8 @@ def fit_critics(
     cost_loss: CVaRCostLoss,
     critic_optim: torch.optim.Optimizer,
 ) -> dict[str, float]:
-    """Some rounds of new targets, each with one pass of gradient steps over its transitions.
-
-    A step whose gradient is not finite is skipped and counted: it would poison the critics and the
-    moments of Adam for good.
-
-    Raises:
-        FloatingPointError: if more than ``optim.max_skipped`` steps had to be skipped.
-    """
-    skipped = 0
+    """Some rounds of new targets, each with one pass of gradient steps over its transitions."""
+    descent = Descent(cfg, critic_optim)
     for _ in range(cfg.optim.critic_rounds):
         # Targets are renewed each round: one round is one step of value iteration.
         with timeit("time/targets"):
@@ -121,24 +115,9 @@ def fit_critics(
                 loss_qvalue, _ = reward_loss.qvalue_v2_loss(minibatch)
                 losses = cost_loss(minibatch)
                 losses["loss_qvalue"] = loss_qvalue
-                sum(loss for name, loss in losses.items() if name.startswith("loss_")).backward()
-                norm = nn.utils.clip_grad_norm_(
-                    critic_optim.param_groups[0]["params"], cfg.optim.max_grad_norm
-                )
-                if norm.isfinite():
-                    critic_optim.step()
-                else:
-                    skipped += 1
-                critic_optim.zero_grad()
-                if skipped > cfg.optim.max_skipped:
-                    values = {name: loss.item() for name, loss in losses.items()}
-                    raise FloatingPointError(
-                        f"{skipped} critic steps were not finite, more than "
-                        f"optim.max_skipped={cfg.optim.max_skipped}: gradient norm "
-                        f"{norm.item()}, losses {values}."
-                    )
+                descent.step(losses)
     metrics = {f"update/{name}": value.item() for name, value in losses.items()}
-    return metrics | {"update/skipped_critic_steps": float(skipped)}
+    return metrics | {"update/skipped_steps": float(descent.skipped)}
 
 
 def with_targets(

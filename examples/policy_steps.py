@@ -6,6 +6,7 @@ from collections.abc import Callable
 from typing import Any
 
 import torch
+from descent import Descent
 from omegaconf import DictConfig
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
@@ -82,12 +83,10 @@ class Multiplier:
 
 
 def ascend(
-    optim: torch.optim.Optimizer, closure: Callable[[], TensorDict], multiplier: Tensor
+    descent: Descent, closure: Callable[[], TensorDict], multiplier: Tensor
 ) -> dict[str, float]:
     """One gradient step up the Lagrangian of a trust region's closure."""
     out = closure()
     value = lagrangian(out["objective"], out["constraint"], multiplier)
-    optim.zero_grad()
-    (-value).backward()
-    optim.step()
+    descent.step(TensorDict(loss_policy=-value))
     return {"update/lagrangian": value.item(), "update/multiplier": multiplier.item()}

@@ -18,6 +18,7 @@ from pathlib import Path
 import hydra
 import torch
 from config import check_config
+from descent import Descent
 from omegaconf import DictConfig, OmegaConf
 from tensordict import TensorDictBase
 from tensordict.nn import NormalParamExtractor, TensorDictModule
@@ -134,14 +135,12 @@ def main(cfg: DictConfig) -> None:
             if ended.any():
                 row["train_return"] = batch["next", "episode_reward"][ended].mean().item()
             if frames >= cfg.collector.init_frames:
+                descent = Descent(cfg, optim)
                 for _ in range(updates):
                     sample = buffer.sample()
                     losses = loss(sample)
-                    terms = [value for name, value in losses.items() if name.startswith("loss_")]
-                    sum(terms).backward()
-                    optim.step()
-                    optim.zero_grad()
-                    target_updater.step()
+                    if descent.step(losses):
+                        target_updater.step()
                 row |= {name: losses[name].item() for name in ("alpha", "loss_qvalue")}
                 row["trace"] = mean_trace(actor, sample).item()
             if frames % cfg.eval.interval == 0:

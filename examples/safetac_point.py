@@ -21,6 +21,7 @@ from critics import (
     make_losses,
     minibatches,
 )
+from descent import Descent
 from omegaconf import DictConfig
 from policy_steps import Multiplier, ascend, cost_limit_at, make_trust_region
 from tensordict import TensorDict, TensorDictBase
@@ -120,9 +121,11 @@ def main(cfg: DictConfig) -> None:
                 metrics |= policy_optim.step(closure).to_dict()
             else:
                 multiplier.update((level - limit)[None])
+                descent = Descent(cfg, policy_optim)
                 for states in minibatches(visited, cfg.lagrangian.minibatch_size):
                     closure = policy_closure(policy, reward_loss, cost_loss, states)
-                    metrics |= ascend(policy_optim, closure, multiplier())
+                    metrics |= ascend(descent, closure, multiplier())
+                metrics["update/skipped_steps"] += descent.skipped
         return {**metrics, "update/constraint": level.item(), "update/cost_limit": limit}
 
     train(run, policy, update, eval_env)

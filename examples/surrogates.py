@@ -6,6 +6,7 @@ from collections.abc import Callable
 
 import torch
 from critics import minibatches
+from descent import Descent
 from omegaconf import DictConfig
 from tensordict import TensorDict, TensorDictBase
 from torch import nn
@@ -49,13 +50,12 @@ def fit_critics(
     critic_optim: torch.optim.Optimizer,
 ) -> dict[str, float]:
     """One pass of gradient steps over steps with their targets."""
+    descent = Descent(cfg, critic_optim)
     for minibatch in minibatches(data, cfg.optim.minibatch_size):
         losses = cost_loss(minibatch).update(reward_loss(minibatch))
-        sum(losses.values()).backward()
-        nn.utils.clip_grad_norm_(critic_optim.param_groups[0]["params"], cfg.optim.max_grad_norm)
-        critic_optim.step()
-        critic_optim.zero_grad()
-    return {f"update/{name}": value.item() for name, value in losses.items()}
+        descent.step(losses)
+    metrics = {f"update/{name}": value.item() for name, value in losses.items()}
+    return metrics | {"update/skipped_steps": float(descent.skipped)}
 
 
 def surrogate_closure(

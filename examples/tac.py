@@ -11,6 +11,7 @@ from __future__ import annotations
 import hydra
 import torch
 from critics import REPLAYED
+from descent import Descent
 from omegaconf import DictConfig
 from tensordict import TensorDictBase
 from torchrl._utils import timeit
@@ -47,14 +48,14 @@ def main(cfg: DictConfig) -> None:
         buffer.extend(batch.select(*REPLAYED).flatten())
         if run.frames < cfg.collector.init_frames:
             return {}
+        descent = Descent(cfg, optim)
         with timeit("time/update"):
             for _ in range(cfg.optim.num_updates):
                 losses = loss(buffer.sample())
-                optim.zero_grad()
-                sum(value for name, value in losses.items() if name.startswith("loss_")).backward()
-                optim.step()
-                target.step()
-        return {f"update/{name}": value.item() for name, value in losses.items()}
+                if descent.step(losses):
+                    target.step()
+        metrics = {f"update/{name}": value.item() for name, value in losses.items()}
+        return metrics | {"update/skipped_steps": float(descent.skipped)}
 
     train(run, policy, update, eval_env)
 

@@ -11,6 +11,7 @@ from __future__ import annotations
 import hydra
 import torch
 from critics import REPLAYED
+from descent import Descent
 from omegaconf import DictConfig
 from policy_steps import Multiplier, cost_limit_at
 from tensordict import TensorDictBase
@@ -74,6 +75,7 @@ def run_wcsac(cfg: DictConfig) -> None:
         cost_loss.cost_limit.fill_(limit)
         level = cost_loss.on_policy_cvar(batch)
         multiplier.update((level - limit)[None])
+        descent = Descent(cfg, optim)
         with timeit("time/update"):
             for _ in range(cfg.optim.num_updates):
                 minibatch = buffer.sample()
@@ -87,14 +89,13 @@ def run_wcsac(cfg: DictConfig) -> None:
                 )
                 entropy = -q_logarithm(log_prob.detach(), cfg.loss.entropic_index)
                 losses["loss_alpha"] = reward_loss.alpha_loss(-entropy).mean()
-                optim.zero_grad()
-                sum(loss for name, loss in losses.items() if name.startswith("loss_")).backward()
-                optim.step()
-                for target in targets:
-                    target.step()
+                if descent.step(losses):
+                    for target in targets:
+                        target.step()
         metrics = {f"update/{name}": value.item() for name, value in losses.items()}
         return {
             **metrics,
+            "update/skipped_steps": float(descent.skipped),
             "update/constraint": level.item(),
             "update/cost_limit": limit,
             "update/multiplier": multiplier().item(),

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import copy
+import importlib
+import itertools
 import math
 from pathlib import Path
 
@@ -14,6 +16,8 @@ import safetac_point
 import torch
 import utils
 from torch.utils._pytree import tree_leaves
+
+from torchrl_safe import record
 
 TINY = [
     "num_threads=1",
@@ -89,7 +93,7 @@ def test_data(update, key, bad):
     batch, state = update.batch.clone(), update.state()
     batch[key].fill_(bad)
     metrics = update.fit(batch)
-    assert metrics["update/skipped_critic_steps"] == 2
+    assert metrics["update/skipped_steps"] == 2
     assert update.is_at(state)
     if key != ("next", "reward"):  # the policy's step sees rewards through the critics only
         report = update.step(batch)
@@ -97,7 +101,7 @@ def test_data(update, key, bad):
         assert "nan" in report.reason or "inf" in report.reason
         assert update.is_at(state)
     # Training goes on with the next good batch.
-    assert update.fit(update.batch)["update/skipped_critic_steps"] == 0
+    assert update.fit(update.batch)["update/skipped_steps"] == 0
     assert not update.is_at(state)
 
 
@@ -106,10 +110,10 @@ def test_gradients(update, bad):
     state = update.state()
     param = update.critic_optim.param_groups[0]["params"][0]
     hook = param.register_hook(lambda grad: torch.full_like(grad, bad))
-    assert update.fit(update.batch)["update/skipped_critic_steps"] == 2
+    assert update.fit(update.batch)["update/skipped_steps"] == 2
     assert update.is_at(state)
     hook.remove()
-    assert update.fit(update.batch)["update/skipped_critic_steps"] == 0
+    assert update.fit(update.batch)["update/skipped_steps"] == 0
 
 
 def test_stops_by_configuration(update, monkeypatch):
@@ -119,3 +123,117 @@ def test_stops_by_configuration(update, monkeypatch):
     with pytest.raises(FloatingPointError, match=r"optim.max_skipped=0: .*'loss_qvalue': nan"):
         update.fit(batch)
     assert update.is_at(state)
+
+
+@BAD
+@pytest.mark.parametrize("critic", ["qvalue_network_params", "cost_network_params"])
+def test_critic_outputs(update, critic, bad):
+    """A critic that went bad teaches nothing to the others, and the policy does not follow it."""
+    owner = update.losses[critic.startswith("cost")]
+    param = next(iter(getattr(owner, critic).parameters()))
+    good = param.detach().clone()
+    with torch.no_grad():
+        param.fill_(bad)
+    state = update.state()
+    assert update.fit(update.batch)["update/skipped_steps"] == 2
+    report = update.step(update.batch)
+    assert not report.accepted
+    assert "the closure returned" in report.reason
+    with torch.no_grad():  # NaN is unequal to itself: bad and all, nothing has moved
+        assert param.isnan().all() if math.isnan(bad) else (param == bad).all()
+        param.copy_(good)
+    state = update.state()
+    assert update.fit(update.batch)["update/skipped_steps"] == 0
+    assert update.step(update.batch).reason == ""
+    assert not update.is_at(state)
+
+
+@BAD
+@pytest.mark.parametrize("where", ["curvature", "gradient"])
+def test_curvature_products_and_policy_gradients(update, bad, where):
+    state = update.state()
+
+    def spoiled(old, new):
+        kl = policy_steps.policy_kl(old, new)
+        if new["mean"].requires_grad and where == "curvature":
+            new["mean"].register_hook(lambda grad: grad * bad)
+        return kl
+
+    param = next(update.policy.parameters())
+    hook = param.register_hook(lambda grad: grad * bad if where == "gradient" else grad)
+    optim = policy_steps.make_trust_region(update.cfg, update.policy)
+    optim.statistics_kl = spoiled
+    good, update.policy_optim = update.policy_optim, optim
+    try:
+        report = update.step(update.batch)
+    finally:
+        update.policy_optim = good
+        hook.remove()
+    if where == "curvature" or not report.accepted:
+        assert not report.accepted
+        assert report.reason == "a gradient or a product with the curvature is not finite"
+        assert update.is_at(state)
+    assert update.step(update.batch).accepted
+    assert not update.is_at(state)
+
+
+class TestScripts:
+    """A reward that is not a number enters the second batch of a run, and of its replay buffer."""
+
+    @pytest.fixture
+    def spoiled(self, monkeypatch):
+        calls = itertools.count(1)
+
+        def count_violations(batch):
+            if next(calls) == 2:
+                batch["next", "reward"].fill_(math.nan)
+            return record.count_violations(batch)
+
+        monkeypatch.setattr(utils, "count_violations", count_violations)
+
+    COMMON = (
+        "num_threads=1 env.num_envs=4 env.episode_length=50 collector.frames_per_batch=200 "
+        "collector.init_frames=0 collector.total_frames=600 policy.num_cells=[8] "
+        "critic.num_cells=[8] eval.interval=10000 eval.num_episodes=1 eval.num_steps=5 "
+        "eval.final_episodes=1 video.num_steps=0"
+    )
+    GRADIENT = "replay_buffer.size=2000 optim.num_updates=3 optim.minibatch_size=50"
+    SURROGATE = "optim.critic_rounds=1 optim.minibatch_size=100"
+    REPLAY = "replay_buffer.size=2000 optim.critic_frames=200 optim.policy_frames=200"
+
+    SCRIPTS = pytest.mark.parametrize(
+        ("name", "overrides"),
+        [
+            ("tac", GRADIENT),
+            ("wcsac", GRADIENT),
+            ("trc", SURROGATE),
+            ("offpolicy_trc", f"{SURROGATE} {REPLAY}"),
+            ("safetac_point", f"{SURROGATE} {REPLAY} update=pid"),
+        ],
+    )
+
+    def launch(self, name, run_dir, overrides):
+        with hydra.initialize_config_dir(
+            str(Path(safetac_point.__file__).parent), version_base="1.3"
+        ):
+            options = f"run_dir={run_dir} {self.COMMON} {overrides}".split()
+            cfg = hydra.compose(name, options)
+        importlib.import_module(name).main.__wrapped__(cfg)
+
+    @SCRIPTS
+    def test_goes_on(self, spoiled, tmp_path, name, overrides):
+        run_dir = tmp_path / "run"
+        self.launch(name, run_dir, overrides)
+        skipped = record.read_metrics(run_dir / "log")["update/skipped_steps"][1]
+        assert len(skipped) == 3
+        assert skipped[0] == 0
+        assert skipped[1] > 0
+        for checkpoint in (run_dir / "checkpoints").glob("*/components/*loss*"):
+            for file in checkpoint.glob("state/*.memmap"):
+                numbers = torch.from_file(str(file), size=file.stat().st_size // 4)
+                assert numbers.isfinite().all(), file
+
+    @SCRIPTS
+    def test_stops_by_configuration(self, spoiled, tmp_path, name, overrides):
+        with pytest.raises(FloatingPointError, match=r"optim.max_skipped=0: .*losses .*nan"):
+            self.launch(name, tmp_path / "run", f"{overrides} optim.max_skipped=0")

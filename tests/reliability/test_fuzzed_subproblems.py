@@ -1,0 +1,168 @@
+"""Random and degenerate subproblems: always an answer, never a step that breaks a constraint.
+
+The optimality conditions are checked from the vectors that a problem was made of, which the solver
+does not see: in a convex problem they hold at the optimum of any solver and nowhere else. Hundreds
+of problems are compared with scipy's general solver besides.
+"""
+
+from __future__ import annotations
+
+import time
+import warnings
+
+import numpy as np
+import pytest
+from scipy.optimize import minimize
+
+from torchrl_safe.optim.subproblem import solve_subproblem
+
+CASES = ("unconstrained", "inert", "feasible", "recoverable", "infeasible", "rejected")
+
+
+class Problem:
+    """``max g'x`` under ``c + B x <= 0`` and ``x'x <= 2 delta``; the metric is the identity.
+
+    That is no restriction: the solver sees products only, which are those of any metric.
+    """
+
+    def __init__(self, rng: np.random.Generator) -> None:
+        m, n = rng.integers(0, 5), rng.integers(1, 6)
+        self.g = rng.normal(size=n) * 10.0 ** rng.uniform(-8, 8)
+        self.b = rng.normal(size=(m, n)) * 10.0 ** rng.uniform(-8, 8, size=(m, 1))
+        self.delta = 10.0 ** rng.uniform(-8, 2)
+        # Degenerate in one way of many: parallel, opposite, zero, normal to each other.
+        for i in range(m):
+            kind = rng.integers(0, 12)
+            if kind == 0:
+                self.b[i] = self.g * rng.choice([-1, 1]) * 10.0 ** rng.uniform(-3, 3)
+            elif kind == 1 and i:
+                self.b[i] = self.b[i - 1] * rng.choice([-1, 1])
+            elif kind == 2:
+                self.b[i] = 0
+            elif kind == 3:
+                self.b[i, rng.integers(n) :] = 0
+        if rng.integers(20) == 0:
+            self.g = np.zeros(n)
+        self.norm = np.linalg.norm(self.b, axis=1)
+        self.radius = np.sqrt(2 * self.delta)
+        distance = rng.uniform(-1.5, 1.5, size=m)
+        distance[rng.random(m) < 0.1] = 0
+        if rng.random() < 0.5:
+            distance = -np.abs(distance)
+        self.c = distance * np.where(self.norm > 0, self.norm * self.radius, 1)
+        self.ratio = rng.choice([1.0, 0.7, 0.1])
+
+    def solve(self):
+        q, r, s = self.g @ self.g, self.b @ self.g, self.b @ self.b.T
+        return solve_subproblem(q, r, s, self.c, self.delta, self.ratio)
+
+    def step(self, solution) -> np.ndarray:
+        """In radii of the region, [n]."""
+        x = solution.objective_weight * self.g - solution.constraint_weight @ self.b
+        return x / self.radius
+
+    @property
+    def scaled(self) -> tuple[np.ndarray, np.ndarray]:
+        """Unit normals [m, n] and distances [m] in radii of the region; zero gradients drop out."""
+        kept = self.norm > 0
+        normals = self.b[kept] / self.norm[kept, None]
+        return normals, self.c[kept] / (self.norm[kept] * self.radius)
+
+
+def check(problem: Problem) -> str:
+    """The properties that every answer has; returns its case."""
+    solution = problem.solve()
+    assert solution.case in CASES
+    assert np.isfinite([solution.objective_weight, *solution.constraint_weight]).all()
+    if solution.case == "rejected":
+        assert solution.reason
+        assert not solution.objective_weight
+        assert not solution.constraint_weight.any()
+        return solution.case
+    x = problem.step(solution)
+    normals, distance = problem.scaled
+    assert np.linalg.norm(x) <= 1 + 1e-6
+    after = distance + normals @ x
+    if solution.case in ("unconstrained", "inert", "feasible"):
+        assert (after <= 1e-6).all()
+        assert problem.g @ x >= -1e-6 * np.linalg.norm(problem.g) or (distance > -1e-6).any()
+        check_optimal(problem, solution, x, after)
+    else:
+        violated = distance > 0
+        assert violated.any()
+        assert (after[~violated] <= 1e-6).all()
+        assert (after[violated] <= distance[violated] + 1e-6).all()
+        assert after.max() <= distance.max() + 1e-6
+        if solution.case == "recoverable":
+            assert (after <= 1e-6).all()
+    return solution.case
+
+
+def check_optimal(problem: Problem, solution, x: np.ndarray, after: np.ndarray) -> None:
+    """KKT: ``g = lam x + B'nu`` with ``lam, nu >= 0``, and nothing but active constraints in it."""
+    length = np.linalg.norm(problem.g)
+    if length == 0 or solution.objective_weight == 0:
+        return
+    lam = 1 / solution.objective_weight * problem.radius / length
+    nu = solution.constraint_weight / solution.objective_weight * problem.norm / length
+    scale = max(1.0, lam, *np.abs(nu))
+    normals = problem.b / np.where(problem.norm > 0, problem.norm, 1)[:, None]
+    residual = problem.g / length - lam * x - nu @ normals
+    assert np.abs(residual).max() <= 1e-6 * scale
+    assert lam > 0
+    assert (nu >= -1e-6 * scale).all()
+    active = np.zeros(len(problem.c), bool)
+    active[problem.norm > 0] = np.abs(after) <= 1e-5
+    assert (np.abs(nu[~active]) <= 1e-6 * scale).all()
+    assert abs(np.linalg.norm(x) - 1) <= 1e-5 or lam <= 1e-6 * scale
+
+
+@pytest.mark.parametrize("count", [2000, pytest.param(100_000, marks=pytest.mark.slow)])
+def test_every_answer_is_safe_and_optimal(count):
+    rng = np.random.default_rng(0)
+    seen = dict.fromkeys(CASES, 0)
+    slowest = 0.0
+    for _ in range(count):
+        problem = Problem(rng)
+        start = time.process_time()
+        seen[check(problem)] += 1
+        slowest = max(slowest, time.process_time() - start)
+    assert all(number > count // 200 for number in seen.values()), seen
+    assert slowest < 1.0  # of this process's own time: no hang
+
+
+def test_no_answer_is_worse_than_a_general_solver_s():
+    """Which sees the vectors, knows nothing of faces, and starts from several points."""
+    rng, compared = np.random.default_rng(1), 0
+    while compared < 200:
+        problem = Problem(rng)
+        solution = problem.solve()
+        length = np.linalg.norm(problem.g)
+        if solution.case not in ("inert", "feasible") or length == 0:
+            continue
+        normals, distance = problem.scaled
+        best = problem.g @ problem.step(solution) / length
+        rules = [
+            {"type": "ineq", "fun": lambda y: 1 - y @ y, "jac": lambda y: -2 * y},
+            {
+                "type": "ineq",
+                "fun": lambda y, n=normals, d=distance: -d - n @ y,
+                "jac": lambda y, n=normals: -n,
+            },
+        ]
+        direction = problem.g / length
+        for start in (np.zeros_like(direction), 0.5 * direction, problem.step(solution)):
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # of starts outside
+                found = minimize(
+                    lambda y, d=direction: -d @ y,
+                    start,
+                    jac=lambda y, d=direction: -d,
+                    constraints=rules,
+                    method="SLSQP",
+                    options={"ftol": 1e-12, "maxiter": 200},
+                )
+            y = found.x
+            if y @ y <= 1 + 1e-8 and (distance + normals @ y <= 1e-8).all():
+                assert direction @ y <= best + 1e-4
+        compared += 1

@@ -117,7 +117,8 @@ def test_gradients(update, bad):
 
 
 def test_stops_by_configuration(update, monkeypatch):
-    monkeypatch.setattr(update.cfg.optim, "max_skipped", 0)
+    monkeypatch.setattr(update, "cfg", copy.deepcopy(update.cfg))
+    update.cfg.optim.max_skipped = 0
     batch, state = update.batch.clone(), update.state()
     batch["next", "reward"].fill_(math.nan)
     with pytest.raises(FloatingPointError, match=r"optim.max_skipped=0: .*'loss_qvalue': nan"):

@@ -11,6 +11,7 @@ from torchrl_safe.envs import GoalTask, Robot, get_robot
 from torchrl_safe.envs._random import RandomStreams
 from torchrl_safe.envs.robots import Motion, to_robot_frame
 from torchrl_safe.envs.tasks import goal as tasks
+from torchrl_safe.envs.tasks.base import goal_reward
 
 KEEPOUT = 0.4
 
@@ -222,7 +223,7 @@ def test_goal_reward_against_a_loop():
     rng = np.random.default_rng(0)
     before, after = rng.uniform(0, 1, (2, 500))
     after[0] = 0.3
-    reward, reached = tasks.goal_reward(before, after, 0.3)
+    reward, reached = goal_reward(before, after, 0.3)
     for i in range(500):
         bonus = 1.0 if after[i] <= 0.3 else 0.0
         assert reward[i] == pytest.approx(before[i] - after[i] + bonus, abs=1e-15)

@@ -113,7 +113,7 @@ def check_optimal(problem: Problem, x: np.ndarray, after: np.ndarray) -> None:
     assert residual <= 1e-5
 
 
-@pytest.mark.parametrize("count", [2000, pytest.param(100_000, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("count", [2000, pytest.param(100_000, marks=pytest.mark.long)])
 def test_every_answer_is_safe_and_optimal(count):
     rng = np.random.default_rng(0)
     seen = dict.fromkeys(CASES, 0)

@@ -22,7 +22,7 @@ def frames_saved(run_dir: Path) -> list[str]:
     return sorted(path.name for path in (run_dir / "checkpoints").iterdir())
 
 
-@pytest.mark.parametrize("kills", [3, pytest.param(100, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("kills", [3, pytest.param(100, marks=pytest.mark.long)])
 def test_kills(kills):
     result = subprocess.run(
         [sys.executable, Path(__file__).with_name("interruption.py"), "--kills", str(kills)],

@@ -1,9 +1,12 @@
-"""Frames per second of every face beside the physics floor of the same model: a Markdown table.
+"""Frames per second of every face, and their share of the physics alone: a Markdown table a robot.
 
-    python benchmarks/bench_faces.py point        # about a minute a robot
+    python benchmarks/bench_faces.py              # all robots: at most four minutes; or name some
 
-Each figure is the median of rounds in which all rows take turns, so that a busy machine slows them
-alike. A frame is a step of one environment.
+A frame is a step of one environment. The floor is the physics of the same compiled model on
+MuJoCo's thread pool, with as many threads, and nothing else but the robot's map from actions to
+actuators. All rows take turns, so that a busy machine slows them alike: a figure is the median of
+rounds, a share the median of the ratios within a round. Where other work keeps the cores,
+``--num-threads 1 --processor-time`` compares what the rows themselves use.
 """
 
 from __future__ import annotations
@@ -13,31 +16,99 @@ import statistics
 import time
 from collections.abc import Callable
 from functools import partial
-from typing import Any
+from itertools import cycle
 
 import gymnasium
+import mujoco
+import numpy as np
 import torch
-from bench_env import NUM_ENVS, batch, env, mj_step, random_actions
+from mujoco.batch import Batch
 from torchrl.envs import DMControlWrapper, EnvBase, GymWrapper, TransformedEnv
 
-from torchrl_safe.envs import ROBOTS, CostToReward, Robot, cost_from_info, get_robot, suite
+from torchrl_safe.envs import (
+    ROBOTS,
+    CostToReward,
+    Robot,
+    SafeGoalEnv,
+    cost_from_info,
+    get_robot,
+    suite,
+)
 
 torch.set_num_threads(1)
 
+NUM_ENVS = [1, 16, 64, 256]
+FLOOR = "`mujoco.batch`: the floor"
+
+Stepper = Callable[[], object]
+
+
+def compiled_model(robot: Robot) -> mujoco.MjModel:
+    model = mujoco.MjModel.from_xml_path(str(robot.asset_path))
+    model.opt.timestep = robot.timestep
+    return model
+
+
+def random_actions(robot: Robot, num_envs: int) -> cycle[np.ndarray]:
+    rng = np.random.default_rng(0)
+    return cycle(rng.uniform(-1, 1, (64, num_envs, robot.action_dim)).astype(np.float32))
+
 
 def identifier(robot: Robot) -> str:
-    return f"torchrl_safe/{robot.name.capitalize()}Goal-v0"
+    return f"torchrl_safe/{robot.name.title().replace('_', '')}Goal-v0"
 
 
-def vector(robot: Robot, num_envs: int, **options: Any) -> Callable[[], object]:
-    """A gymnasium.vector environment; what is over it resets by itself."""
+def mj_step(robot: Robot, num_envs: int, num_threads: int) -> Stepper:
+    """Physics in a Python loop, a simulation after the other."""
+    model, actions = compiled_model(robot), random_actions(robot, num_envs)
+    simulations = [mujoco.MjData(model) for _ in range(num_envs)]
+    for data in simulations:
+        data.qpos = robot.place(np.zeros((1, 2)), np.zeros(1))[0]
+
+    def step() -> None:
+        for data, action in zip(simulations, next(actions), strict=True):
+            data.ctrl = robot.control(
+                action[None], data.qpos[None], data.qvel[None], np.array([data.time])
+            )[0]
+            mujoco.mj_step(model, data, nstep=robot.substeps)
+
+    return step
+
+
+def batch(robot: Robot, num_envs: int, num_threads: int) -> Stepper:
+    """Physics on MuJoCo's thread pool."""
     actions = random_actions(robot, num_envs)
-    envs = gymnasium.make_vec(identifier(robot), num_envs=num_envs, **options)
+    simulations = Batch(compiled_model(robot), num_envs, num_threads)
+    qpos, qvel = simulations.bind("qpos"), simulations.bind("qvel")
+    qpos[:] = robot.place(np.zeros((num_envs, 2)), np.zeros(num_envs))
+    time, ctrl = simulations.bind("time"), simulations.bind("ctrl")
+
+    def step() -> None:
+        ctrl[:] = robot.control(next(actions), qpos, qvel, time)
+        simulations.step(nstep=robot.substeps)
+
+    return step
+
+
+def vector(robot: Robot, num_envs: int, num_threads: int) -> Stepper:
+    """It resets by itself."""
+    actions = random_actions(robot, num_envs)
+    envs = gymnasium.make_vec(
+        identifier(robot), num_envs=num_envs, num_threads=num_threads, autoreset_mode="SameStep"
+    )
     envs.reset(seed=0)
     return lambda: envs.step(next(actions))
 
 
-def gymnasium_make(robot: Robot, num_envs: int) -> Callable[[], object]:
+def vector_of_singles(robot: Robot, num_envs: int, num_threads: int) -> Stepper:
+    """Gymnasium's own vector environment."""
+    actions = random_actions(robot, num_envs)
+    envs = gymnasium.make_vec(identifier(robot), num_envs=num_envs, vectorization_mode="sync")
+    envs.reset(seed=0)
+    return lambda: envs.step(next(actions))
+
+
+def gymnasium_make(robot: Robot, num_envs: int, num_threads: int) -> Stepper:
     actions, single = random_actions(robot, 1), gymnasium.make(identifier(robot))
     single.reset(seed=0)
 
@@ -49,88 +120,115 @@ def gymnasium_make(robot: Robot, num_envs: int) -> Callable[[], object]:
     return step
 
 
-def dm_control(robot: Robot, num_envs: int) -> Callable[[], object]:
+def dm_control(robot: Robot, num_envs: int, num_threads: int) -> Stepper:
     actions, single = random_actions(robot, 1), suite.load(robot, random=0)
     single.reset()
     return lambda: single.step(next(actions)[0])
 
 
-def torchrl(make: Callable[[Robot, int], EnvBase], robot: Robot, num_envs: int):
-    """As a collector steps it."""
-    wrapped = make(robot, num_envs)
-    actions = random_actions(robot, num_envs)
-    action_spec = wrapped.action_spec
-    state = wrapped.reset()
+def torchrl(make: Callable[..., EnvBase], robot: Robot, num_envs: int, num_threads: int) -> Stepper:
+    """As a collector steps it: tensors and resets."""
+    env = make(robot, num_envs=num_envs, num_threads=num_threads)
+    action_spec = env.action_spec
+    actions = cycle(
+        [
+            torch.from_numpy(action).reshape(action_spec.shape).to(action_spec.dtype)
+            for _, action in zip(range(64), random_actions(robot, num_envs), strict=False)
+        ]
+    )
+    state = env.reset()
 
     def step() -> None:
         nonlocal state
-        action = next(actions).reshape(action_spec.shape)
-        state["action"] = torch.from_numpy(action).to(action_spec.dtype)
-        _, state = wrapped.step_and_maybe_reset(state)
+        state["action"] = next(actions)
+        _, state = env.step_and_maybe_reset(state)
 
     return step
 
 
-def wrapped_gymnasium(robot: Robot, num_envs: int) -> EnvBase:
+def wrapped_gymnasium(robot: Robot, num_envs: int, num_threads: int) -> EnvBase:
     if num_envs == 1:
         return cost_from_info(GymWrapper(gymnasium.make(identifier(robot))))
-    envs = gymnasium.make_vec(identifier(robot), num_envs=num_envs, autoreset_mode="Disabled")
+    envs = gymnasium.make_vec(
+        identifier(robot), num_envs=num_envs, num_threads=num_threads, autoreset_mode="Disabled"
+    )
     return cost_from_info(GymWrapper(envs))
 
 
-def wrapped_dm_control(robot: Robot, num_envs: int) -> EnvBase:
+def wrapped_dm_control(robot: Robot, num_envs: int, num_threads: int) -> EnvBase:
     wrapper = DMControlWrapper(suite.load(robot, random=0))
     return TransformedEnv(wrapper, CostToReward(violation_key=None))
 
 
-ROWS: dict[str, tuple[Callable[[Robot, int], Callable[[], object]], list[int]]] = {
-    "`mj_step` in a loop, 1 thread": (partial(mj_step, num_threads=1), NUM_ENVS),
-    "`mujoco.batch`, 2 threads": (partial(batch, num_threads=2), NUM_ENVS),
-    "`SafeGoalEnv`, 2 threads": (partial(env, num_threads=2), NUM_ENVS),
-    "`gymnasium.make_vec`, 2 threads": (partial(vector, autoreset_mode="SameStep"), NUM_ENVS),
+ROWS: dict[str, tuple[Callable[..., Stepper], list[int]]] = {
+    "`mj_step` in a loop, 1 thread": (mj_step, NUM_ENVS),
+    FLOOR: (batch, NUM_ENVS),
+    "`SafeGoalEnv`": (partial(torchrl, partial(SafeGoalEnv, stagger=True)), NUM_ENVS),
+    "`gymnasium.make_vec`": (vector, NUM_ENVS),
     "the same in TorchRL's `GymWrapper`": (partial(torchrl, wrapped_gymnasium), NUM_ENVS),
-    '`make_vec(..., vectorization_mode="sync")`': (
-        partial(vector, vectorization_mode="sync"),
-        [16, 64],
-    ),
+    '`make_vec(..., vectorization_mode="sync")`, 1 thread': (vector_of_singles, [16]),
     "`gymnasium.make`": (gymnasium_make, [1]),
     "`suite.load`": (dm_control, [1]),
     "the same in TorchRL's `DMControlWrapper`": (partial(torchrl, wrapped_dm_control), [1]),
 }
 
+Cell = tuple[str, int]
 
-def measure(robot: Robot, rounds: int, seconds: float) -> dict[tuple[str, int], float]:
-    """Frames per second."""
-    steppers = {
-        (row, num_envs): make(robot, num_envs)
-        for row, (make, sizes) in ROWS.items()
-        for num_envs in sizes
-    }
-    rates: dict[tuple[str, int], list[float]] = {cell: [] for cell in steppers}
+
+def measure(
+    steppers: dict[Cell, Stepper], clock: Callable[[], float], rounds: int, seconds: float
+) -> dict[Cell, list[float]]:
+    """Frames per second in each round."""
+    rates: dict[Cell, list[float]] = {cell: [] for cell in steppers}
     for number in range(rounds + 1):
         for cell, step in steppers.items():
-            count, start = 0, time.perf_counter()
-            while time.perf_counter() - start < seconds:
+            count, start = 0, clock()
+            while clock() - start < seconds:
                 step()
                 count += 1
             if number:  # the first round warms up
-                rates[cell].append(cell[1] * count / (time.perf_counter() - start))
-    return {cell: statistics.median(values) for cell, values in rates.items()}
+                rates[cell].append(cell[1] * count / (clock() - start))
+    return rates
+
+
+def table(name: str, rates: dict[Cell, list[float]]) -> str:
+    def text(row: str, num_envs: int) -> str:
+        if (row, num_envs) not in rates:
+            return ""
+        pairs = zip(rates[row, num_envs], rates[FLOOR, num_envs], strict=True)
+        share = "" if row == FLOOR else f" ({statistics.median(x / y for x, y in pairs):.0%})"
+        return f"{statistics.median(rates[row, num_envs]):,.0f}{share}"
+
+    lines = [
+        [f"{name}, frames/s (share of the floor)", *(f"N = {n}" for n in NUM_ENVS)],
+        ["---", *("---:" for _ in NUM_ENVS)],
+        *([row, *(text(row, n) for n in NUM_ENVS)] for row in ROWS),
+    ]
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("robots", nargs="*", default=list(ROBOTS), help="default: all")
+    parser.add_argument("--num-threads", type=int, default=2)
+    parser.add_argument("--processor-time", action="store_true")
     parser.add_argument("--rounds", type=int, default=7)
-    parser.add_argument("--seconds", type=float, default=0.25, help="of one row in one round")
+    parser.add_argument("--seconds", type=float, default=0.12, help="of one row in one round")
     options = parser.parse_args()
+    clock = time.process_time if options.processor_time else time.perf_counter
     for name in options.robots:
-        rates = measure(get_robot(name), options.rounds, options.seconds)
-        print(f"| {name}, frames/s | " + " | ".join(f"N = {n}" for n in NUM_ENVS) + " |")
-        print("|---|" + "---:|" * len(NUM_ENVS))
-        for row in ROWS:
-            cells = (f"{rates[row, n]:,.0f}" if (row, n) in rates else "" for n in NUM_ENVS)
-            print(f"| {row} | " + " | ".join(cells) + " |")
+        robot = get_robot(name)
+        steppers = {
+            (row, num_envs): make(robot, num_envs, options.num_threads)
+            for num_envs in NUM_ENVS  # rows of one size follow each other
+            for row, (make, sizes) in ROWS.items()
+            if num_envs in sizes
+        }
+        print(table(name, measure(steppers, clock, options.rounds, options.seconds)))
+        env = SafeGoalEnv(robot, num_envs=64, num_threads=options.num_threads)
+        resets: dict[Cell, Stepper] = {("reset", 64): env.reset}
+        (rates,) = measure(resets, clock, options.rounds, options.seconds).values()
+        print(f"\nA reset of 64: {1e3 * 64 / statistics.median(rates):.1f} ms\n", flush=True)
 
 
 if __name__ == "__main__":

@@ -82,6 +82,8 @@ class RobotBatch:
             self._qpos, self._qvel = batch.bind("qpos"), batch.bind("qvel")
             self._time = batch.bind("time")
             self._ctrl, self._qacc = batch.bind("ctrl"), batch.bind("qacc")
+            self._warning = batch.warning
+            self._before = np.empty_like(batch.state)
             if self.variation is not None:
                 self.vary(np.arange(self.num_envs), self.variation)
             if self._saved is not None:
@@ -90,7 +92,7 @@ class RobotBatch:
         return self._batch
 
     def __getstate__(self) -> dict[str, Any]:
-        bound = ("_initial", "_qpos", "_qvel", "_time", "_ctrl", "_qacc")
+        bound = ("_initial", "_qpos", "_qvel", "_time", "_ctrl", "_qacc", "_warning", "_before")
         kept = {name: value for name, value in self.__dict__.items() if name not in bound}
         saved = self._saved if self._batch is None else self._batch.state.copy()
         return kept | {"_batch": None, "_saved": saved}
@@ -133,7 +135,7 @@ class RobotBatch:
             array: [N], the simulations that diverged; they are left as they were before the step.
         """
         batch = self.batch
-        before = batch.state.copy()
+        np.copyto(self._before, batch.state)
         command = self.robot.control(action, self._qpos, self._qvel, self._time)
         self._ctrl[:] = self._late(command)
         try:
@@ -141,11 +143,12 @@ class RobotBatch:
             failed = np.zeros(self.num_envs, bool)
         except SimulationError:
             failed = batch.status != 0
-        failed |= batch.warning[:, _DIVERGED, 1].any(-1)
+        if self._warning.any():  # hardly ever: what follows is left out
+            failed |= self._warning[:, _DIVERGED, 1].any(-1)
         sensed = self.robot.sense(self._qpos, self._qvel, self._qacc)
         if failed.any():
-            batch.state[failed] = before[failed]
-            batch.warning[failed] = 0
+            batch.state[failed] = self._before[failed]
+            self._warning[failed] = 0
             pairs = zip(sensed, self.motion, strict=True)
             sensed = Motion(*(_with_rows(new, failed, old[failed]) for new, old in pairs))
         self.motion = sensed
@@ -220,6 +223,7 @@ class Core:
             name: np.zeros((num_envs, *value.shape[1:])) for name, value in objects.items()
         }
         self._elapsed = np.zeros(num_envs, np.int64)
+        self._rows: Rows = np.arange(num_envs)
         zero, no = np.zeros(num_envs), np.zeros(num_envs, bool)
         blank = np.zeros((num_envs, self.observation_size), np.float32)
         self._frame = Frame(blank, zero, zero, no, no.astype(np.int64), no, no, no)
@@ -248,10 +252,7 @@ class Core:
         Returns:
             Frame: reward zero where reset.
         """
-        if mask is None or not self._started:
-            rows: Rows = np.arange(self.num_envs)
-        else:
-            rows = np.flatnonzero(mask)
+        rows = self._rows if mask is None or not self._started else np.flatnonzero(mask)
         if not rows.size:
             return self._frame
         position, yaw, objects = self.task.sample(self.robot, self._streams, rows)
@@ -307,7 +308,8 @@ class Core:
             bad = np.flatnonzero(~np.isfinite(action).all(-1))
             raise ValueError(f"action must be finite; it is not in environments {bad.tolist()}.")
         # In float64, whatever the face: a command computed in float32 would be another one.
-        failed = self._robots.step(np.clip(action.astype(np.float64), -1.0, 1.0))
+        command = np.minimum(np.maximum(action, -1.0, dtype=np.float64), 1.0)
+        failed = self._robots.step(command)
         self.instabilities += int(failed.sum())
         self._elapsed += 1
         remaining = np.maximum(self.episode_length - self._elapsed, 0)
@@ -316,7 +318,7 @@ class Core:
         outcome = self.task.advance(robot, motion, self._objects, sensed, remaining, self._streams)
         self._objects = outcome.objects
         self._frame = Frame(
-            self._observe(np.arange(self.num_envs), motion, self._objects, sensed.scan),
+            self._observe(self._rows, motion, self._objects, sensed.scan),
             outcome.reward,
             outcome.cost,
             outcome.violations > 0,

@@ -86,12 +86,13 @@ class Robot:
         return _ASSETS / self.asset
 
 
-def to_robot_frame(vector: Array, heading: Array) -> Array:
+def to_robot_frame(vector: Array, heading: Array, out: Array | None = None) -> Array:
     """World vectors seen from the robot: x ahead, y to the left.
 
     Args:
         vector (array): [..., 2].
         heading (array): [..., 2], unit vectors.
+        out (array, optional): [..., 2], written to in place of a new array.
 
     Returns:
         array: [..., 2].
@@ -103,9 +104,10 @@ def to_robot_frame(vector: Array, heading: Array) -> Array:
     """
     x, y = vector[..., 0], vector[..., 1]
     cos, sin = heading[..., 0], heading[..., 1]
-    out = np.empty_like(vector)
-    out[..., 0] = cos * x + sin * y
-    out[..., 1] = cos * y - sin * x
+    if out is None:
+        out = np.empty_like(vector)
+    np.add(cos * x, sin * y, out=out[..., 0])
+    np.subtract(cos * y, sin * x, out=out[..., 1])
     return out
 
 
@@ -139,8 +141,8 @@ def _sense_planar(qpos: Array, qvel: Array, qacc: Array) -> Motion:
     np.cos(qpos[:, 2], out=heading[:, 0])
     np.sin(qpos[:, 2], out=heading[:, 1])
     proprioception = np.empty((len(qpos), 5))
-    proprioception[:, :2] = to_robot_frame(qacc[:, :2], heading)
-    proprioception[:, 2:4] = to_robot_frame(qvel[:, :2], heading)
+    to_robot_frame(qacc[:, :2], heading, out=proprioception[:, :2])
+    to_robot_frame(qvel[:, :2], heading, out=proprioception[:, 2:4])
     proprioception[:, 4] = qvel[:, 2]
     return Motion(qpos[:, :2].copy(), heading, proprioception)
 

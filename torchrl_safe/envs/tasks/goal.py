@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.special import expit
 
 from torchrl_safe.envs._random import RandomStreams
-from torchrl_safe.envs.robots import Array, Motion, Robot, to_robot_frame
+from torchrl_safe.envs.robots import Array, Motion, Robot
 from torchrl_safe.envs.tasks.base import (
     Objects,
     Outcome,
@@ -29,6 +29,7 @@ from torchrl_safe.envs.tasks.base import (
 _LAYOUT_CANDIDATES = 32  # positions tried for one object before its layout is started again
 _LAYOUT_ATTEMPTS = 100  # layouts started before giving up
 _GOAL_CANDIDATES = 256  # positions tried for a goal that moves during an episode
+_NEIGHBOURS = np.arange(3)[:, None, None]  # of a lidar bin: the one before it, itself, the next one
 
 
 @dataclass(frozen=True)
@@ -266,8 +267,10 @@ def lidar(task: GoalTask, offset: Array, distance: Array, heading: Array) -> Arr
         array: [N, B] in [0, 1].
     """
     bins, num_envs = task.lidar_bins, len(offset)
-    ahead = to_robot_frame(offset, heading[:, None])
-    turn = np.arctan2(ahead[..., 1], ahead[..., 0]) * (bins / (2.0 * np.pi))
+    x, y = offset[..., 0], offset[..., 1]
+    cos, sin = heading[:, :1], heading[:, 1:]
+    turn = np.arctan2(cos * y - sin * x, cos * x + sin * y)
+    turn *= bins / (2.0 * np.pi)
     turn += bins * (turn < 0.0)
     centre = turn.astype(np.intp)
     within = turn - centre
@@ -276,11 +279,9 @@ def lidar(task: GoalTask, offset: Array, distance: Array, heading: Array) -> Arr
     # below; there are two on the right because an angle just below zero can round up to a full
     # turn.
     scan = np.zeros((num_envs, bins + 3))
-    flat = scan.reshape(-1)
-    previous = (np.arange(num_envs)[:, None] * (bins + 3) + centre).ravel()
-    np.maximum.at(flat, previous, ((1.0 - within) * reading).ravel())
-    np.maximum.at(flat, previous + 1, reading.ravel())
-    np.maximum.at(flat, previous + 2, (within * reading).ravel())
+    centre += np.arange(0, scan.size, bins + 3)[:, None]
+    shares = np.stack(((1.0 - within) * reading, reading, within * reading))
+    np.maximum.at(scan.reshape(-1), (centre + _NEIGHBOURS).ravel(), shares.ravel())
     scan[:, 1:3] = np.maximum(scan[:, 1:3], scan[:, -2:])
     scan[:, bins] = np.maximum(scan[:, bins], scan[:, 0])
     return scan[:, 1:-2]

@@ -319,20 +319,22 @@ def ray_distances(task: NavigationTask, position: Array, heading: Array, boxes: 
     rays, half = _lidar(task).rays, task.box_half_size
     num_rays = len(rays)
     cos, sin = heading[:, :1], heading[:, 1:]
-    per_x = 1.0 / _not_zero(cos * rays[:, 0] - sin * rays[:, 1])
-    per_y = 1.0 / _not_zero(sin * rays[:, 0] + cos * rays[:, 1])
-    out = np.minimum(
-        task.wall_distance * np.abs(per_x) - position[:, :1] * per_x,
-        task.wall_distance * np.abs(per_y) - position[:, 1:] * per_y,
-    )
-    out = np.minimum(out, task.lidar_range)
+    per_x = _inverse(cos * rays[:, 0] - sin * rays[:, 1])
+    per_y = _inverse(sin * rays[:, 0] + cos * rays[:, 1])
+    out = task.wall_distance * np.abs(per_x)
+    out -= position[:, :1] * per_x
+    to_wall_y = task.wall_distance * np.abs(per_y)
+    to_wall_y -= position[:, 1:] * per_y
+    np.minimum(out, to_wall_y, out=out)
+    np.minimum(out, task.lidar_range, out=out)
     out[np.abs(position).max(-1) > task.wall_distance] = task.lidar_range
 
     # A box meets few rays, those within the angle of the disc around it: no others are looked at.
     radius = np.sqrt(2.0) * half
     offset = boxes - position[:, None]
-    row, column = np.nonzero((offset * offset).sum(-1) < (task.lidar_range + radius) ** 2)
-    x, y = offset[row, column].T
+    x, y = offset[..., 0], offset[..., 1]
+    row, column = np.nonzero(x * x + y * y < (task.lidar_range + radius) ** 2)
+    x, y = x[row, column], y[row, column]
     distance = np.hypot(x, y)
     spread = np.where(distance > radius, np.arcsin(radius / np.maximum(distance, radius)), np.pi)
     first_ray = np.arctan2(heading[:, 1], heading[:, 0]) + _FIRST_RAY
@@ -343,22 +345,28 @@ def ray_distances(task: NavigationTask, position: Array, heading: Array, boxes: 
     bearing = np.concatenate((bearing, bearing[again] - 2.0 * np.pi))
     spread = spread[pair]
     per_angle = (num_rays - 1) / (-2.0 * _FIRST_RAY)
-    first = np.ceil((bearing - spread) * per_angle).clip(0.0).astype(np.intp)
-    last = np.floor((bearing + spread) * per_angle).clip(None, num_rays - 1.0).astype(np.intp)
-    count = (last - first + 1).clip(0)
+    first = np.maximum(np.ceil((bearing - spread) * per_angle), 0.0).astype(np.intp)
+    last = np.minimum(np.floor((bearing + spread) * per_angle), num_rays - 1.0).astype(np.intp)
+    count = np.maximum(last - first + 1, 0)
     start = row[pair] * num_rays + first - count.cumsum() + count
     index = np.repeat(start, count)
     index += np.arange(len(index))
-    pair = np.repeat(pair, count)
 
     # Slabs: a ray is in a box where it is within both of its strips.
-    per_x, per_y = per_x.ravel()[index], per_y.ravel()[index]
-    centre_x, centre_y = x[pair] * per_x, y[pair] * per_y
-    half_x, half_y = half * np.abs(per_x), half * np.abs(per_y)
+    per_x, per_y = per_x.ravel().take(index), per_y.ravel().take(index)
+    centre_x, centre_y = np.repeat(x[pair], count), np.repeat(y[pair], count)
+    centre_x *= per_x
+    centre_y *= per_y
+    half_x = np.abs(per_x, out=per_x)
+    half_x *= half
+    half_y = np.abs(per_y, out=per_y)
+    half_y *= half
     enter = np.maximum(centre_x - half_x, centre_y - half_y)
-    leave = np.minimum(centre_x + half_x, centre_y + half_y)
+    centre_x += half_x
+    centre_y += half_y
+    leave = np.minimum(centre_x, centre_y, out=centre_x)
     hit = np.flatnonzero((enter <= leave) & (leave >= 0.0))
-    np.minimum.at(out.reshape(-1), index[hit], enter[hit].clip(0.0))
+    np.minimum.at(out.reshape(-1), index.take(hit), np.maximum(enter.take(hit), 0.0))
     return out
 
 
@@ -392,7 +400,7 @@ def contact(
     overlap = (np.abs(offset) <= half + reach[:, None]).all(-1)
     overlap &= np.abs(cos * x + sin * y) <= half_length + box_reach
     overlap &= np.abs(cos * y - sin * x) <= half_width + box_reach
-    return at_wall | (overlap.sum(-1) > 0)
+    return at_wall | overlap.any(-1)
 
 
 def proximity_cost(task: NavigationTask, nearest: Array) -> tuple[Array, Mask]:
@@ -426,5 +434,9 @@ def remaining_cost(steps: NDArray[np.int64], discount: float) -> Array:
     return discount * (1.0 - discount ** steps.astype(float)) / (1.0 - discount)
 
 
-def _not_zero(x: Array) -> Array:
-    return np.copysign(np.maximum(np.abs(x), 1e-12), x)
+def _inverse(x: Array) -> Array:
+    """``1 / x``, finite and of the sign of x at zero too."""
+    size = np.abs(x)
+    np.maximum(size, 1e-12, out=size)
+    np.copysign(size, x, out=size)
+    return np.divide(1.0, size, out=size)

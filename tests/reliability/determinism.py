@@ -27,6 +27,7 @@ import test_baselines as baselines  # noqa: E402
 import test_doggo_controller as doggo  # noqa: E402
 import tiny  # noqa: E402
 import torch  # noqa: E402
+from safetensors.numpy import load_file  # noqa: E402
 from torchrl.envs import TransformedEnv  # noqa: E402
 from torchrl.modules import MLP  # noqa: E402
 
@@ -99,7 +100,8 @@ def numbers(folder: Path) -> dict[str, np.ndarray]:
     found = {}
     if (folder / "log").exists():
         for name, (steps, values) in read_metrics(folder / "log").items():
-            if not name.startswith("time/"):
+            # TorchRL's trainer times its hooks, in a table of the process that every logger reads.
+            if not name.startswith(("time/", "hook/")):
                 found |= {f"{name}, steps": steps, name: values}
     if (folder / "results.json").exists():
         results = json.loads((folder / "results.json").read_text())
@@ -110,7 +112,7 @@ def numbers(folder: Path) -> dict[str, np.ndarray]:
     if (folder / "episodes.json").exists():
         found["episodes"] = np.array(json.loads((folder / "episodes.json").read_text()))
     for file in folder.glob("*.safetensors"):
-        found[file.name] = np.frombuffer(file.read_bytes(), np.uint8)
+        found |= load_file(file)
     return found
 
 

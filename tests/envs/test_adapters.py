@@ -11,6 +11,7 @@ from torchrl.envs import (
     DMControlWrapper,
     GymEnv,
     GymWrapper,
+    RenameTransform,
     RewardSum,
     SerialEnv,
     StepCounter,
@@ -145,6 +146,15 @@ class TestCostToReward:
         env = DMControlWrapper(suite.load("point", random=0))
         env = TransformedEnv(env, CostToReward(violation_key=("flags", "unsafe")))
         check_safe_env(env, violation_key=("flags", "unsafe"))
+
+    def test_another_name_for_the_cost(self):
+        env = DMControlWrapper(suite.load("point", random=0, episode_length=9))
+        env = TransformedEnv(env, RenameTransform(["cost"], ["danger"]))
+        env.append_transform(CostToReward(cost_key="danger", violation_key=None))
+        assert {"reward", "danger"} <= set(env.full_reward_spec.keys())
+        check_safe_env(env, cost_key="danger", time_limit=9)
+        with pytest.raises(Exception, match="cost"):  # the default looks for another
+            check_safe_env(env, time_limit=9)
 
     def test_violation(self):
         env = DMControlWrapper(suite.load("point", random=0))

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import importlib.util
 
+import onnxruntime
 import pytest
 import torch
 from tensordict import TensorDict
@@ -70,6 +71,28 @@ def test_two_inputs(tmp_path):
     torch.testing.assert_close(
         torch.export.load(path).module()(scan, pose), policy.get_dist(data).deterministic_sample
     )
+
+
+def test_onnx(tmp_path):
+    """The inputs' names are the keys, joined; any number of states."""
+
+    class Sum(nn.Module):
+        def __init__(self):
+            super().__init__()
+            self.first, self.second = nn.Linear(3, 5), nn.Linear(2, 5)
+
+        def forward(self, first, second):
+            return self.first(first) + self.second(second)
+
+    policy = GMMTanhPolicy(Sum(), SPEC, num_components=1, in_keys=["scan", ("body", "pose")])
+    data = TensorDict(
+        {"scan": torch.randn(4, 3), "body": {"pose": torch.randn(4, 2)}}, batch_size=4
+    )
+    path = export_policy(policy, tmp_path / "policy.onnx", data[:1])
+    inputs = {"scan": data["scan"].numpy(), "body.pose": data["body", "pose"].numpy()}
+    (action,) = onnxruntime.InferenceSession(path).run(["action"], inputs)
+    expected = policy.get_dist(data).deterministic_sample
+    torch.testing.assert_close(torch.from_numpy(action), expected)
 
 
 class TestMisuse:

@@ -237,6 +237,19 @@ class TestCritics:
         out = make_loss(reduction="none")(make_data())
         assert out["loss_cost_value"].shape == out["cost_std"].shape == (4, 6)
 
+    @pytest.mark.parametrize("use", ["auto", True, False])
+    def test_priority_weights(self, use):
+        loss = make_loss(use_prioritized_weights=use)
+        data = make_data()
+        data["cost_target"], data["std_target"] = loss.compute_target(data)
+        data = data.flatten()
+        weight = torch.rand(24, dtype=torch.float64)
+        data["priority_weight"] = weight
+        for name in ("loss_cost_value", "loss_cost_std"):
+            each = torch.stack([loss(data[i : i + 1])[name] for i in range(24)])
+            expected = each.mean() if use is False else (weight * each).sum() / weight.sum()
+            torch.testing.assert_close(loss(data)[name], expected)
+
     def test_target_networks(self):
         loss = make_loss(delay_cost=True)
         updater = SoftUpdate(loss, eps=0.5)

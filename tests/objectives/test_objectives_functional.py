@@ -3,6 +3,7 @@ from __future__ import annotations
 import math
 
 import mpmath
+import numpy as np
 import pytest
 import torch
 from scipy import stats
@@ -14,6 +15,7 @@ from torchrl_safe.objectives.functional import (
     gaussian_cvar,
     moment_matched_kl,
     q_logarithm,
+    surrogate_change,
     uniform_tsallis_entropy,
 )
 
@@ -101,6 +103,52 @@ class TestUnits:
     def test_bad_arguments(self, rate, gamma):
         with pytest.raises(ValueError, match="must be"):
             discounted_cost_limit(rate, gamma)
+
+
+class TestSurrogateChange:
+    """Against sums over the actions of a bandit, which has no state to come."""
+
+    @staticmethod
+    def example():
+        rng = np.random.default_rng(0)
+        new, old, sampler = rng.dirichlet(np.ones(4), 3)
+        advantage = rng.normal(size=4)
+        counts = np.round(sampler * 40_000).astype(int)  # every action as often as it is drawn
+        actions = np.arange(4).repeat(counts)
+        args = [torch.tensor(np.log(p)[actions]) for p in (new, old, sampler)]
+        return new, old, counts / counts.sum(), advantage, actions, args, sampler
+
+    @pytest.mark.parametrize("gamma", [0.0, 0.8])
+    def test_off_policy(self, gamma):
+        new, old, visits, advantage, actions, args, sampler = self.example()
+        weight = np.minimum(1, old / sampler)
+        assert (weight < 1).any()
+        assert (weight == 1).any()
+        centred = advantage - (visits * weight * advantage).sum() / (visits * weight).sum()
+        expected = (visits * (new / old - 1) * weight * centred).sum() / (1 - gamma)
+        actual = surrogate_change(*args, torch.tensor(advantage[actions]), gamma)
+        assert actual.item() == pytest.approx(expected, rel=1e-9)
+
+    def test_on_policy_it_is_the_change_of_the_mean(self):
+        new, old, _, advantage, _, _, _ = self.example()
+        counts = np.round(old * 40_000).astype(int)
+        old = counts / counts.sum()
+        actions = np.arange(4).repeat(counts)
+        log_new, log_old = (torch.tensor(np.log(p)[actions]) for p in (new, old))
+        value = torch.tensor(advantage[actions])
+        actual = surrogate_change(log_new, log_old, log_old, value, 0.9)
+        assert actual.item() == pytest.approx(10 * (new - old) @ advantage, rel=1e-9)
+
+    def test_misuse(self):
+        x = torch.zeros(3)
+        for position in range(4):
+            args = [x] * 4
+            args[position] = x[:2]
+            with pytest.raises(ValueError, match=r"must have the same shape, got .*\(2,\)"):
+                surrogate_change(*args, 0.9)
+        for gamma in (-0.1, 1.0, math.nan):
+            with pytest.raises(ValueError, match=rf"gamma must be in \[0, 1\), got {gamma}"):
+                surrogate_change(x, x, x, x, gamma)
 
 
 class TestMomentMatchedKL:

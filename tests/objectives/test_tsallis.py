@@ -233,6 +233,25 @@ class TestLossModule:
         weighted, _ = loss.qvalue_v2_loss(data)
         single, _ = loss.qvalue_v2_loss(data[2:3].exclude("priority_weight"))
         torch.testing.assert_close(weighted, single)
+        unweighted = TsallisLoss(*blocks, delay_qvalue=False, use_prioritized_weights=False)
+        unweighted.make_value_estimator()
+        unweighted.load_state_dict(loss.state_dict())
+        plain, _ = loss.qvalue_v2_loss(data.exclude("priority_weight"))
+        torch.testing.assert_close(unweighted.qvalue_v2_loss(data)[0], plain)
+
+    @pytest.mark.parametrize(("init", "kept"), [(0.05, 0.2), (0.3, 0.3), (2.0, 0.4)])
+    def test_alpha_stays_between_its_bounds(self, blocks, init, kept):
+        """Where it is used: in the policy's loss, which is linear in it."""
+        losses = []
+        for options in (
+            {"alpha_init": init, "min_alpha": 0.2, "max_alpha": 0.4},
+            {"alpha_init": kept},
+        ):
+            torch.manual_seed(0)
+            loss = TsallisLoss(*blocks, delay_qvalue=False, **options)
+            losses.append(loss(make_data()))
+        assert losses[0]["alpha"].item() == pytest.approx(kept, rel=1e-6)
+        torch.testing.assert_close(losses[0]["loss_actor"], losses[1]["loss_actor"])
 
     def test_keys(self, blocks):
         actor, _ = blocks

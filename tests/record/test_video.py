@@ -146,6 +146,26 @@ def test_exploration_type_and_random_state(tmp_path):
     assert torch.equal(before, torch.get_rng_state())
 
 
+def test_seed_is_the_environments_and_the_actions(tmp_path):
+    class Seeded(FilmedEnv):
+        def _set_seed(self, seed):
+            self.seeds = [*getattr(self, "seeds", []), seed]
+
+    env, actions = Seeded(), []
+    before = torch.get_rng_state()
+
+    def noisy(td):
+        actions.append(torch.randn(*td.batch_size, 1))
+        return td.set("action", actions[-1])
+
+    for seed in (3, 3, 4):
+        record_video(env, noisy, tmp_path / "a.mp4", num_steps=1, width=16, height=16, seed=seed)
+    assert env.seeds == [3, 3, 4]
+    assert actions[0].equal(actions[1])
+    assert not actions[0].equal(actions[2])
+    assert torch.equal(before, torch.get_rng_state())
+
+
 @pytest.mark.parametrize("fails_at", [0, 3])
 def test_failing_render_leaves_no_file_and_no_process(tmp_path, monkeypatch, fails_at):
     writers = []

@@ -141,8 +141,10 @@ def train(
         for batch in collector if run.frames_left else ():
             run.counters["frames"] += batch.numel()
             run.counters["total_cvs"] += count_violations(batch)
+            run.counters["instabilities"] += int(batch["next", "diverged"].sum())
             metrics = batch_metrics(batch)
             metrics["train/total_cvs"] = run.counters["total_cvs"]
+            metrics["train/instabilities"] = run.counters["instabilities"]
             metrics["train/entropy"] = -batch["action_log_prob"].mean().item()
             metrics |= update(batch)
             collector.update_policy_weights_()
@@ -212,7 +214,7 @@ class Run:
     def __init__(self, cfg: DictConfig, **components: Any) -> None:
         self.cfg = cfg
         self.path = Path(cfg.run_dir)
-        self.counters = Counters(frames=0, total_cvs=0, seconds=0.0)
+        self.counters = Counters(frames=0, total_cvs=0, instabilities=0, seconds=0.0)
         self._saved: int | None = None  # frames of the newest checkpoint
         self.checkpoint = Checkpoint()
         self._register(counters=self.counters, random=GlobalRNGState(), **components)

@@ -35,7 +35,7 @@ class SafeGoalEnv(EnvBase):
     * ``reward`` and ``cost``, [N, 1];
     * ``violation``, [N, 1] bool, inside a hazard; ``violations``, [N, 1] int64, how many violating
       steps this one counts for: a contact stands for the rest of its episode; ``goal_met``, [N, 1]
-      bool, goal reached in this step; ``diverged``, [N, 1] bool, the simulation failed in this step;
+      bool, goal reached in this step; ``diverged``, [N, 1] bool, the simulation failed in it;
     * ``done``, ``terminated``, ``truncated``, [N, 1] bool.
 
     Each environment draws from its own random stream, so its layouts depend on the seed and its

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import signal
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
+from queue import Empty
 from typing import Any
 
 import torch
@@ -20,6 +22,7 @@ from torchrl.collectors import (
 )
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType
+from torchrl.weight_update import SharedMemWeightSyncScheme
 
 BACKENDS = ("single", "multi_sync", "multi_async", "ray")
 
@@ -41,7 +44,8 @@ def make_collector(
     * ``ray``: as ``multi_sync``, in actors of the Ray cluster that ``RAY_ADDRESS`` or this machine
       has, else of one started here. Its machines need this library, not the example's files.
 
-    Call ``update_policy_weights_`` on it after every update.
+    Call ``update_policy_weights_`` on it after every update. If a worker dies, it or the next batch
+    raises :class:`WorkerDied` within seconds, with the other workers stopped.
 
     Args:
         cfg (DictConfig): the run's configuration.
@@ -76,13 +80,12 @@ def make_collector(
     creators: list[Callable[[], EnvBase]] = [
         partial(_in_worker, make_env, share, worker_seed(seed, i)) for i in range(num_workers)
     ]
-    if backend == "multi_sync":
-        return MultiSyncCollector(
-            creators, policy, cat_results="stack", postproc=_joined, **options
-        )
     if backend == "ray":
         return _ray_collector(creators, policy, options)
-    return MultiAsyncCollector(creators, policy, **options)
+    options["weight_sync_schemes"] = {"policy": _Weights()}
+    if backend == "multi_sync":
+        return _SyncCollector(creators, policy, cat_results="stack", postproc=_joined, **options)
+    return _AsyncCollector(creators, policy, **options)
 
 
 class ResumableCollector(Collector):
@@ -109,6 +112,74 @@ class ResumableCollector(Collector):
         self._traj_pool.load_state_dict(state_dict["collector"]["traj_pool"])
 
 
+class WorkerDied(RuntimeError):
+    """A process that collects has ended; the message says which one, and what to do."""
+
+
+class _Watched:
+    """A collector of several processes that says which of them has died."""
+
+    def iterator(self) -> Iterator[TensorDictBase]:
+        with self._watch():
+            yield from super().iterator()
+
+    def update_policy_weights_(self, *args: Any, **kwargs: Any) -> None:
+        with self._watch():
+            super().update_policy_weights_(*args, **kwargs)
+
+    def dead(self) -> dict[int, str]:
+        """How each worker that has died ended, by its number."""
+        # TorchRL closes those that it has stopped because of another one.
+        ended = {
+            i: process.exitcode
+            for i, process in enumerate(self.procs)
+            if not process._closed and not process.is_alive()
+        }
+        return {
+            i: f"exit code {code}" if code >= 0 else f"killed by {signal.Signals(-code).name}"
+            for i, code in ended.items()
+        }
+
+    @contextmanager
+    def _watch(self) -> Iterator[None]:
+        try:
+            yield
+        except Exception as error:
+            dead = self.dead()
+            if not dead:
+                raise
+            self.shutdown()
+            which = ", ".join(f"worker {i} ({how})" for i, how in dead.items())
+            raise WorkerDied(
+                f"of the collector.num_workers={self.num_workers}, "
+                f"{which} died, and the run stopped. A system out of memory kills: then lower "
+                "env.num_envs or collector.num_workers. Go on with the same command and "
+                "resume=true."
+            ) from error
+
+
+class _SyncCollector(_Watched, MultiSyncCollector):
+    pass
+
+
+class _AsyncCollector(_Watched, MultiAsyncCollector):
+    pass
+
+
+class _Weights(SharedMemWeightSyncScheme):
+    """TorchRL's way of handing out weights, which waits for a dead worker's receipt for ever."""
+
+    def _wait_for_ack(self, worker_ids: Any = None, timeout: float | None = None) -> None:
+        for worker, receipts in self._ack_queues.items():
+            while True:
+                try:
+                    receipts.get(timeout=1.0)
+                    break
+                except Empty:
+                    if worker in self.context.dead():
+                        raise RuntimeError(f"no receipt from worker {worker}.") from None
+
+
 def _ray_collector(
     creators: list[Callable[[], EnvBase]],
     policy: Callable[[TensorDictBase], TensorDictBase],
@@ -117,12 +188,24 @@ def _ray_collector(
     import ray
     from torchrl.collectors.distributed import RayCollector
 
+    class WatchedRayCollector(_Watched, RayCollector):
+        def dead(self) -> dict[int, str]:
+            ended = {}
+            for i, worker in enumerate(self.remote_collectors):
+                try:
+                    ray.get(worker.__ray_ready__.remote(), timeout=5.0)
+                except ray.exceptions.GetTimeoutError:
+                    pass  # it is busy
+                except ray.exceptions.RayActorError as error:
+                    ended[i] = type(error).__name__
+            return ended
+
     here = Path(__file__).parent
     for module in list(sys.modules.values()):
         if (path := getattr(module, "__file__", None)) and Path(path).parent == here:
             ray.cloudpickle.register_pickle_by_value(module)
     transforms = options.pop("auto_register_policy_transforms")
-    return RayCollector(
+    return WatchedRayCollector(
         creators,
         policy,
         sync=True,

@@ -224,7 +224,9 @@ def main(cfg: DictConfig) -> None:
     with GracefulStop() as stop:
         for batch in collector:
             run.counters["frames"] += batch.numel()
+            run.counters["instabilities"] += int(batch["next", "diverged"].sum())
             metrics = update(cfg, batch, loss, advantage, optim)
+            metrics["train/instabilities"] = run.counters["instabilities"]
             # Steps get smaller towards the end.
             for group in optim.param_groups:
                 group["lr"] = cfg.optim.lr * max(1.0 - run.frames / total, 0.1)

@@ -12,7 +12,8 @@ import json
 import os
 import signal
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from types import FrameType
@@ -20,7 +21,7 @@ from typing import Any
 
 import torch
 from checkpoints import adapter_of, latest, load_component, remove_leftovers, write_atomically
-from collectors import make_collector
+from collectors import WorkerDied, make_collector
 from config import check_config
 from omegaconf import DictConfig, OmegaConf
 from tensordict import TensorDictBase
@@ -136,13 +137,15 @@ def train(
     )
     timeit.erase()  # what was timed before is not the run's
     started = time.perf_counter()
-    with GracefulStop() as stop:
+    with GracefulStop() as stop, run.saved_if_a_worker_dies():
         # None is left of a run that was killed in its final evaluation.
         for batch in collector if run.frames_left else ():
             run.counters["frames"] += batch.numel()
             run.counters["total_cvs"] += count_violations(batch)
+            run.counters["instabilities"] += int(batch["next", "diverged"].sum())
             metrics = batch_metrics(batch)
             metrics["train/total_cvs"] = run.counters["total_cvs"]
+            metrics["train/instabilities"] = run.counters["instabilities"]
             metrics["train/entropy"] = -batch["action_log_prob"].mean().item()
             metrics |= update(batch)
             collector.update_policy_weights_()
@@ -212,7 +215,7 @@ class Run:
     def __init__(self, cfg: DictConfig, **components: Any) -> None:
         self.cfg = cfg
         self.path = Path(cfg.run_dir)
-        self.counters = Counters(frames=0, total_cvs=0, seconds=0.0)
+        self.counters = Counters(frames=0, total_cvs=0, instabilities=0, seconds=0.0)
         self._saved: int | None = None  # frames of the newest checkpoint
         self.checkpoint = Checkpoint()
         self._register(counters=self.counters, random=GlobalRNGState(), **components)
@@ -293,6 +296,15 @@ class Run:
         if self._saved != self.frames:  # to replace one by its like could lose both to a kill
             self.rotation.save(self.checkpoint, step=self.frames)
             self._saved = self.frames
+
+    @contextmanager
+    def saved_if_a_worker_dies(self) -> Iterator[None]:
+        """Everything learned is in this process: nothing of it is lost."""
+        try:
+            yield
+        except WorkerDied:
+            self.save()
+            raise
 
     def evaluate(
         self, env: EnvBase, policy: Callable[[TensorDictBase], TensorDictBase]

@@ -108,6 +108,7 @@ class TestSpecs:
             "violation": (1, torch.bool),
             "violations": (1, torch.int64),
             "goal_met": (1, torch.bool),
+            "diverged": (1, torch.bool),
             "done": (1, torch.bool),
             "terminated": (1, torch.bool),
             "truncated": (1, torch.bool),
@@ -464,7 +465,8 @@ def test_a_diverging_simulation_is_truncated_and_counted(tmp_path, monkeypatch):
     expected = reference.step(td.clone())["next"]
     following = env.step(td.clone())["next"]
     assert env.instabilities == 1
-    assert following["truncated"].flatten().tolist() == [False, True, False]
+    for key in ("diverged", "truncated"):
+        assert following[key].flatten().tolist() == [False, True, False]
     assert not following["terminated"].any()
     assert (following["observation"][1] == before["observation"][1]).all()
     assert following["cost"][1] == before["cost"][1]
@@ -474,6 +476,7 @@ def test_a_diverging_simulation_is_truncated_and_counted(tmp_path, monkeypatch):
     td["action"] = torch.zeros(3, 2)
     following = env.step(td)["next"]
     assert env.instabilities == 2
+    assert not td["diverged"].any()
     assert not following["done"].any()
     assert following["observation"].isfinite().all()
 

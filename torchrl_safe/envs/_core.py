@@ -181,7 +181,7 @@ class Core:
 
     A simulation that diverges is put back where it was, and its episode is truncated: it repeats
     its last observation and cost without a reward, and nothing non-finite reaches a learner.
-    ``instabilities`` counts them.
+    ``diverged`` [N] says which did in the last step, ``instabilities`` counts them.
 
     Built by :func:`make_core`.
     """
@@ -213,6 +213,7 @@ class Core:
         self.episode_length = episode_length
         self.stagger = stagger
         self.instabilities = 0
+        self.diverged = np.zeros(num_envs, bool)
         self.action_dim = robot.action_dim
         self.observation_size = task.observation_size(robot)
         self.randomization = randomization
@@ -264,6 +265,7 @@ class Core:
         }
         staggered = self.stagger and mask is None
         self._elapsed[rows] = rows * self.episode_length // self.num_envs if staggered else 0
+        self.diverged = _with_rows(self.diverged, rows, np.zeros(1, bool))
         self._started = True
         motion = Motion(*(part[rows] for part in self._robots.motion))
         sensed = self.task.sense(self.robot, motion, objects)
@@ -309,8 +311,8 @@ class Core:
             raise ValueError(f"action must be finite; it is not in environments {bad.tolist()}.")
         # In float64, whatever the face: a command computed in float32 would be another one.
         command = np.minimum(np.maximum(action, -1.0, dtype=np.float64), 1.0)
-        failed = self._robots.step(command)
-        self.instabilities += int(failed.sum())
+        self.diverged = self._robots.step(command)
+        self.instabilities += int(self.diverged.sum())
         self._elapsed += 1
         remaining = np.maximum(self.episode_length - self._elapsed, 0)
         robot, motion = self.robot, self._robots.motion
@@ -325,7 +327,7 @@ class Core:
             outcome.violations,
             outcome.goal_met,
             outcome.terminated,
-            truncated=(remaining == 0) | failed,
+            truncated=(remaining == 0) | self.diverged,
         )
         return self._frame
 

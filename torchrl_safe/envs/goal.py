@@ -35,12 +35,13 @@ class SafeGoalEnv(EnvBase):
     * ``reward`` and ``cost``, [N, 1];
     * ``violation``, [N, 1] bool, inside a hazard; ``violations``, [N, 1] int64, how many violating
       steps this one counts for: a contact stands for the rest of its episode; ``goal_met``, [N, 1]
-      bool, goal reached in this step;
+      bool, goal reached in this step; ``diverged``, [N, 1] bool, the simulation failed in it;
     * ``done``, ``terminated``, ``truncated``, [N, 1] bool.
 
     Each environment draws from its own random stream, so its layouts depend on the seed and its
     index alone; a rollout is the same on any number of threads. A simulation that diverges repeats
-    its last observation and is truncated; ``env.instabilities`` counts such steps.
+    its last observation, ``diverged``, and is truncated, so that a collector resets it;
+    ``env.instabilities`` counts such steps.
 
     Args:
         robot (str or Robot): the robot, or its name in ``torchrl_safe.envs.ROBOTS``. Default:
@@ -110,6 +111,7 @@ class SafeGoalEnv(EnvBase):
             violation=flag(),
             violations=Bounded(0, episode_length, (num_envs, 1), device=device, dtype=torch.int64),
             goal_met=flag(),
+            diverged=flag(),
             shape=(num_envs,),
             device=device,
         )
@@ -161,6 +163,7 @@ class SafeGoalEnv(EnvBase):
             "violation": _column(frame.violation),
             "violations": _column(frame.violations),
             "goal_met": _column(frame.goal_met),
+            "diverged": _column(self._core.diverged),
             "done": _column(frame.terminated | frame.truncated),
             "terminated": _column(frame.terminated),
             "truncated": _column(frame.truncated),

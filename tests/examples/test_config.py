@@ -85,7 +85,7 @@ def test_message(name, value, message):
 def test_memmap_is_for_the_cpu(monkeypatch):
     monkeypatch.setitem(config.RULES, "device", config.NAME)  # as where there is a GPU
     config.check_config(compose("safetac_point", "device=cuda"))
-    with pytest.raises(ValueError, match="memmap keeps the replay on the CPU.*got 'cuda'"):
+    with pytest.raises(ValueError, match=r"memmap keeps the replay on the CPU.*got 'cuda'"):
         config.check_config(compose("safetac_point", "device=cuda", "replay_buffer.storage=memmap"))
 
 

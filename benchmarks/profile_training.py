@@ -43,7 +43,7 @@ PARTS = {
     "time/policy": "trust-region step",
 }
 UPDATE, SIMULATOR = "update", "simulator"
-NUM_TIMED = 2  # updates without the profiler, after the warm-up
+NUM_TIMED = 1  # updates without the profiler, after the warm-up
 
 
 def marked(name: str, call: Callable[..., Any]) -> Callable[..., Any]:

@@ -39,7 +39,10 @@ ROOT = Path(__file__).resolve().parents[1]
 EXAMPLES = ROOT / "examples"
 TABLE = ROOT / "benchmarks" / "results" / "scaling.csv"
 PICTURE = ROOT / "docs" / "images" / "scaling.png"
-BASE = ["num_threads=1", "collector.init_frames=0", "optim.critic_rounds=2"]
+BASE = [
+    *("num_threads=1", "collector.init_frames=0", "optim.critic_rounds=2"),
+    "replay_buffer.size=100_000",  # a run ends with a checkpoint of it
+]
 NUM_UPDATES = 3  # measured, after one that warms up
 PARTS = ("collect and other", "targets", "critics", "policy")
 AXES: dict[str, list[int]] = {
@@ -115,7 +118,7 @@ def measure(options: list[str]) -> Iterator[tuple[str, int, str, float]]:
             if axis == "frames in the replay":
                 cost = replay_cost(options, value)
             else:
-                cost = training_cost([*overrides(axis, value), *options])
+                cost = training_cost([*options, *overrides(axis, value)])
             print(f"{axis} {value}: {sum(cost.values()):.0f} us a frame", file=sys.stderr)
             for part, microseconds in cost.items():
                 yield axis, value, part, microseconds

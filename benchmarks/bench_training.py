@@ -12,6 +12,7 @@ from pathlib import Path
 
 import hydra
 import numpy as np
+from omegaconf import DictConfig
 
 from torchrl_safe.record import read_metrics
 
@@ -30,12 +31,17 @@ SILENT = [
 OMNISAFE_CPO = 129
 
 
+def warm_up_updates(cfg: DictConfig) -> int:
+    """Updates up to the first one that learns, which warms up."""
+    return max(1, -(-cfg.collector.init_frames // cfg.collector.frames_per_batch))
+
+
 def main(overrides: list[str]) -> None:
     """Train for a few updates and print the table."""
     with hydra.initialize_config_dir(str(EXAMPLE.parent), version_base="1.3"):
         cfg = hydra.compose(EXAMPLE.stem, overrides)
-    per_batch, warm_up = cfg.collector.frames_per_batch, cfg.collector.init_frames
-    updates = max(-(-warm_up // per_batch), 1) + NUM_UPDATES  # the first one warms up
+    per_batch = cfg.collector.frames_per_batch
+    updates = warm_up_updates(cfg) + NUM_UPDATES
     with tempfile.TemporaryDirectory() as run_dir:
         training = [*SILENT, f"collector.total_frames={updates * per_batch}", f"run_dir={run_dir}"]
         command = [sys.executable, EXAMPLE, *overrides, *training]

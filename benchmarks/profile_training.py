@@ -27,7 +27,7 @@ import critics
 import hydra
 import safetac_point
 import utils
-from bench_training import SILENT
+from bench_training import SILENT, warm_up_updates
 from torch.autograd.profiler_util import FunctionEvent
 from torch.profiler import ProfilerActivity, profile, record_function
 from torchrl._utils import timeit
@@ -93,10 +93,8 @@ def record(overrides: list[str]) -> tuple[list[FunctionEvent], float, float]:
         tuple: the profiler's events, seconds of the profiled update, and of one without profiler.
     """
     with hydra.initialize_config_dir(str(EXAMPLES), version_base="1.3"):
-        cfg = hydra.compose(
-            "safetac_point", ["num_threads=1", "collector.init_frames=0", *overrides, *SILENT]
-        )
-    updates = 1 + NUM_TIMED + 1  # the first one warms up, the last one is profiled
+        cfg = hydra.compose("safetac_point", ["num_threads=1", *overrides, *SILENT])
+    updates = warm_up_updates(cfg) + NUM_TIMED + 1  # the last one is profiled
     cfg.collector.total_frames = updates * cfg.collector.frames_per_batch
     profiler = profile(activities=[ProfilerActivity.CPU])
     ended: list[float] = []
@@ -119,7 +117,7 @@ def record(overrides: list[str]) -> tuple[list[FunctionEvent], float, float]:
         with redirect_stdout(sys.stderr):
             safetac_point.main.__wrapped__(cfg)
     spans = [end - begin for begin, end in zip(begun, ended[1:updates], strict=False)]
-    return profiler.events(), spans[-1], statistics.median(spans[:-1])
+    return profiler.events(), spans[-1], statistics.median(spans[-1 - NUM_TIMED : -1])
 
 
 def attribute(events: Iterable[FunctionEvent]) -> tuple[Counter, Counter, Counter]:

@@ -26,7 +26,7 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "examples"))
 import hydra
 import numpy as np
 import safetac_point
-from bench_training import SILENT
+from bench_training import SILENT, warm_up_updates
 from collectors import make_collector
 from critics import REPLAYED, make_buffer
 from matplotlib.figure import Figure
@@ -40,7 +40,7 @@ EXAMPLES = ROOT / "examples"
 TABLE = ROOT / "benchmarks" / "results" / "scaling.csv"
 PICTURE = ROOT / "docs" / "images" / "scaling.png"
 BASE = [
-    *("num_threads=1", "collector.init_frames=0", "optim.critic_rounds=2"),
+    *("num_threads=1", "optim.critic_rounds=2"),
     "replay_buffer.size=100_000",  # a run ends with a checkpoint of it
 ]
 NUM_UPDATES = 3  # measured, after one that warms up
@@ -76,7 +76,9 @@ def training_cost(options: list[str]) -> dict[str, float]:
     with tempfile.TemporaryDirectory() as run_dir:
         cfg = compose(options, run_dir)
         per_batch = cfg.collector.frames_per_batch
-        cfg.collector.total_frames = (1 + NUM_UPDATES) * per_batch
+        # Every environment has slices to draw from when learning begins.
+        cfg.collector.init_frames = 2 * cfg.replay_buffer.slice_len * cfg.env.num_envs
+        cfg.collector.total_frames = (warm_up_updates(cfg) + NUM_UPDATES) * per_batch
         with redirect_stdout(sys.stderr):
             safetac_point.main.__wrapped__(cfg)
         metrics = read_metrics(Path(run_dir, "log"))

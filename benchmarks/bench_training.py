@@ -1,7 +1,6 @@
-"""Frames per second of the whole training loop, and where the time goes.
+"""Frames per second of the whole training loop, and where the time goes: a Markdown table.
 
-python benchmarks/bench_training.py                # defaults of the example
-python benchmarks/bench_training.py num_threads=1  # any option of it
+python benchmarks/bench_training.py num_threads=1  # any option of the example; about a minute
 """
 
 from __future__ import annotations
@@ -13,11 +12,18 @@ from pathlib import Path
 
 import hydra
 import numpy as np
+from omegaconf import DictConfig
 
-from torchrl_safe.record import format_table, read_metrics
+from torchrl_safe.record import read_metrics
 
 EXAMPLE = Path(__file__).resolve().parents[1] / "examples" / "safetac_point.py"
-NUM_UPDATES = 15
+NUM_UPDATES = 8
+PAPER_FRAMES = 10_000_000
+# What a measured run does not need.
+SILENT = [
+    *("eval.interval=1_000_000_000", "checkpoint.interval=1_000_000_000"),
+    *("eval.num_episodes=1", "eval.final_episodes=2", "eval.num_steps=10", "video.num_steps=0"),
+]
 
 # OmniSafe 0.5's CPO on PointGoal1 with its defaults: steps per second of the whole training loop,
 # one thread of a comparable two-core machine. Recorded, because OmniSafe cannot be installed beside
@@ -25,34 +31,36 @@ NUM_UPDATES = 15
 OMNISAFE_CPO = 129
 
 
+def warm_up_updates(cfg: DictConfig) -> int:
+    """Updates up to the first one that learns, which warms up."""
+    return max(1, -(-cfg.collector.init_frames // cfg.collector.frames_per_batch))
+
+
 def main(overrides: list[str]) -> None:
     """Train for a few updates and print the table."""
     with hydra.initialize_config_dir(str(EXAMPLE.parent), version_base="1.3"):
         cfg = hydra.compose(EXAMPLE.stem, overrides)
-    per_batch, warm_up = cfg.collector.frames_per_batch, cfg.collector.init_frames
-    total = (-(-warm_up // per_batch) - 1 + NUM_UPDATES) * per_batch
+    per_batch = cfg.collector.frames_per_batch
+    updates = warm_up_updates(cfg) + NUM_UPDATES
     with tempfile.TemporaryDirectory() as run_dir:
-        training = [
-            *("eval.interval=1_000_000_000", "checkpoint.interval=1_000_000_000"),
-            *("eval.final_episodes=2", "eval.num_steps=10", "video.num_steps=0"),
-            *(f"collector.total_frames={total}", f"run_dir={run_dir}"),
-        ]
-        subprocess.run([sys.executable, EXAMPLE, *overrides, *training], check=True)
+        training = [*SILENT, f"collector.total_frames={updates * per_batch}", f"run_dir={run_dir}"]
+        command = [sys.executable, EXAMPLE, *overrides, *training]
+        subprocess.run(command, check=True, stdout=sys.stderr)
         metrics = read_metrics(Path(run_dir, "log"))
 
-    frames, speed = metrics["time/frames_per_second"]
-    seconds = (per_batch / speed)[frames >= warm_up]
+    seconds = (per_batch / metrics["time/frames_per_second"][1])[-NUM_UPDATES:]
     parts = {name: metrics[f"time/{name}"][1] for name in ("targets", "critics", "policy")}
+    parts = {name: part[-NUM_UPDATES:] for name, part in parts.items()}
     parts["other (collection, replay, logging)"] = seconds - sum(parts.values())
     speed = per_batch / np.median(seconds)
-    rows: dict[str, float | str] = {
-        f"frames/s, median of {len(seconds)} updates": f"{speed:.0f}",
-        "frames/s, CPO of OmniSafe 0.5 (recorded)": str(OMNISAFE_CPO),
-        "ratio": f"{speed / OMNISAFE_CPO:.1f}",
-    }
+    print(f"| median of {NUM_UPDATES} updates | |")
+    print("|---|---:|")
+    print(f"| frames/s | {speed:,.0f} |")
+    print(f"| hours of {PAPER_FRAMES:,} frames | {PAPER_FRAMES / speed / 3600:.2f} |")
+    print(f"| frames/s, CPO of OmniSafe 0.5 (recorded elsewhere) | {OMNISAFE_CPO} |")
+    print(f"| ratio | {speed / OMNISAFE_CPO:.1f} |")
     for name, part in parts.items():
-        rows[f"share of time: {name}"] = f"{part.sum() / seconds.sum():.0%}"
-    print(format_table(rows))
+        print(f"| share of time: {name} | {part.sum() / seconds.sum():.0%} |")
 
 
 if __name__ == "__main__":

@@ -116,7 +116,7 @@ def bench_natural_gradients(benchmark: Any, width: int, curvature: str) -> None:
         damping = cfg.optim.damping
         return conjugate_gradient(lambda v: product(v) + damping * v, rhs, CG_ITERS).solution
 
-    solution = benchmark.pedantic(solve, args=(make_product,), rounds=5, warmup_rounds=1)
+    solution = benchmark.pedantic(solve, args=(make_product,), rounds=3, warmup_rounds=1)
     exact = solve(lambda: hessian_product(policy_kl(old, out["statistics"]), params))
     cosine = torch.cosine_similarity(solution, exact).min().item()
     benchmark.extra_info["smallest cosine to double backward"] = round(cosine, 6)
@@ -144,7 +144,7 @@ def bench_step(benchmark: Any, width: int, curvature: str) -> None:
         closure = closure_of(NUM_STATES // 4 if curvature == "gauss_newton_quarter" else None)
         return (in_terms_of_kl(closure) if curvature == "double_backward" else closure,), {}
 
-    report = benchmark.pedantic(optim.step, setup=setup, rounds=5, warmup_rounds=1)
+    report = benchmark.pedantic(optim.step, setup=setup, rounds=3, warmup_rounds=1)
     benchmark.extra_info |= {
         "case": report.case,
         "backtracks": report.backtracks,

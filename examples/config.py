@@ -9,6 +9,7 @@ from importlib.util import find_spec
 from numbers import Real
 from typing import Any, NamedTuple
 
+import torch
 from collectors import BACKENDS
 from omegaconf import DictConfig, OmegaConf
 
@@ -94,6 +95,13 @@ def stages() -> Rule:
     )
 
 
+def device() -> Rule:
+    """Where tensors can be on this machine."""
+    count = torch.cuda.device_count()
+    names = ["cpu", *(["cuda"] if count else []), *(f"cuda:{i}" for i in range(count))]
+    return one_of(*names)
+
+
 def optional(rule: Rule) -> Rule:
     """As the rule says, or null."""
     return Rule(lambda v: v is None or rule.holds(v), f"null or {rule.text}")
@@ -106,6 +114,7 @@ NAME = Rule(lambda v: isinstance(v, str) and v != "", "a name")
 RULES: dict[str, Rule] = {
     "seed": integer(0),
     "num_threads": integer(1),
+    "device": device(),
     "run_dir": PATH,
     "resume": BOOLEAN,
     "update": one_of("trust_region", "lagrangian", "pid"),
@@ -215,6 +224,11 @@ def check_config(cfg: DictConfig) -> None:
 
 def _check_together(options: Mapping[str, Any]) -> None:
     """Options that depend on one another; those that a configuration lacks are not checked."""
+    if options.get("replay_buffer.storage") == "memmap" and options.get("device", "cpu") != "cpu":
+        raise ValueError(
+            "replay_buffer.storage=memmap keeps the replay on the CPU, so that device must be cpu, "
+            f"got {options['device']!r}."
+        )
     for name, divisor in (
         ("collector.frames_per_batch", "env.num_envs"),
         ("optim.critic_frames", "replay_buffer.slice_len"),

@@ -83,7 +83,7 @@ def make_buffer(cfg: DictConfig) -> TensorDictReplayBuffer:
         folder = Path(cfg.run_dir) / "replay"
         storage: Storage = LazyMemmapStorage(size, scratch_dir=folder, existsok=True, ndim=2)
     elif kind == "memory":
-        storage = LazyTensorStorage(size, ndim=2)
+        storage = LazyTensorStorage(size, ndim=2, device=cfg.device)
     else:
         raise ValueError(f"replay_buffer.storage must be memory or memmap, got {kind!r}.")
     return TensorDictReplayBuffer(
@@ -136,5 +136,4 @@ def with_targets(
 
 def minibatches(data: TensorDictBase, size: int) -> Iterator[TensorDictBase]:
     """All of ``data`` in random order, ``size`` at a time."""
-    for index in torch.randperm(data.numel()).split(size):
-        yield data[index]
+    yield from data[torch.randperm(len(data), device=data.device)].split(size)

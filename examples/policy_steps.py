@@ -50,9 +50,9 @@ class Multiplier:
         if kind == "pid":
             self.module = PIDMultiplier(
                 kp=cfg.pid.kp, ki=cfg.pid.ki, kd=cfg.pid.kd, init=cfg.lagrangian.init
-            )
+            ).to(cfg.device)
         elif kind == "lagrangian":
-            self.module = LagrangeMultiplier(init=cfg.lagrangian.init)
+            self.module = LagrangeMultiplier(init=cfg.lagrangian.init).to(cfg.device)
             self.optim = torch.optim.Adam(self.module.parameters(), lr=cfg.lagrangian.lr)
         else:
             raise ValueError(f"kind must be 'lagrangian' or 'pid', got {kind!r}.")

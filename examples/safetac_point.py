@@ -114,7 +114,8 @@ def main(cfg: DictConfig) -> None:
             visited = batch.select("observation").flatten()
             level = cost_loss.on_policy_cvar(batch)
             if cfg["update"] == "trust_region":
-                states = visited[torch.randperm(len(visited))[: cfg.optim.policy_frames]]
+                order = torch.randperm(len(visited), device=visited.device)
+                states = visited[order[: cfg.optim.policy_frames]]
                 closure = policy_closure(
                     policy, reward_loss, cost_loss, states, level, cfg.optim.curvature_frames
                 )

@@ -39,7 +39,8 @@ def main(cfg: DictConfig) -> None:
     target = SoftUpdate(loss, tau=cfg.optim.tau)
     optim = torch.optim.Adam(loss.parameters(), lr=cfg.optim.lr)
     buffer = TensorDictReplayBuffer(
-        storage=LazyTensorStorage(cfg.replay_buffer.size), batch_size=cfg.optim.minibatch_size
+        storage=LazyTensorStorage(cfg.replay_buffer.size, device=cfg.device),
+        batch_size=cfg.optim.minibatch_size,
     )
     run = Run(cfg, loss=loss, optim=optim, buffer=buffer)
 

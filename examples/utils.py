@@ -63,7 +63,12 @@ def set_up(cfg: DictConfig) -> None:
 def make_env(cfg: DictConfig, num_envs: int, seed: int, **kwargs: Any) -> SafeGoalEnv:
     """A batch of environments with the robot of the configuration."""
     return SafeGoalEnv(
-        cfg.env.robot, num_envs=num_envs, num_threads=cfg.num_threads, seed=seed, **kwargs
+        cfg.env.robot,
+        num_envs=num_envs,
+        num_threads=cfg.num_threads,
+        seed=seed,
+        device=cfg.device,
+        **kwargs,
     )
 
 
@@ -75,6 +80,7 @@ def make_policy(cfg: DictConfig, env: EnvBase) -> GMMTanhPolicy:
         cfg.policy.num_components * (1 + 2 * action_dim),
         num_cells=list(cfg.policy.num_cells),
         activation_class=nn.ReLU,
+        device=cfg.device,
     )
     return GMMTanhPolicy(
         network,
@@ -97,6 +103,8 @@ def make_critic(
         1,
         num_cells=list(cfg.critic.num_cells),
         activation_class=nn.ReLU,
+        activation_kwargs={"inplace": True},  # half the memory to go through
+        device=cfg.device,
     )
     network.extend(last)
     return ValueOperator(network, in_keys=in_keys, out_keys=[out_key])
@@ -387,6 +395,8 @@ def load_policy(run_dir: str | os.PathLike[str]) -> GMMTanhPolicy:
 def load_run(run_dir: str | os.PathLike[str]) -> tuple[DictConfig, Path]:
     """A run's configuration and the path of its newest checkpoint.
 
+    A run is looked at on the CPU, wherever it was trained.
+
     Raises:
         FileNotFoundError: if the folder holds no run, or one without a checkpoint.
         CheckpointError: if the newest checkpoint cannot be read.
@@ -397,7 +407,9 @@ def load_run(run_dir: str | os.PathLike[str]) -> tuple[DictConfig, Path]:
     checkpoint = latest(path)
     if checkpoint is None:
         raise FileNotFoundError(f"run_dir={run_dir} has no checkpoint yet.")
-    return OmegaConf.load(path / "config.yaml"), checkpoint
+    cfg = OmegaConf.load(path / "config.yaml")
+    cfg.device = "cpu"
+    return cfg, checkpoint
 
 
 class GracefulStop:

@@ -55,7 +55,8 @@ def run_wcsac(cfg: DictConfig) -> None:
     optim = torch.optim.Adam(list(params), lr=cfg.optim.lr)
     multiplier = Multiplier(cfg, "lagrangian")
     buffer = TensorDictReplayBuffer(
-        storage=LazyTensorStorage(cfg.replay_buffer.size), batch_size=cfg.optim.minibatch_size
+        storage=LazyTensorStorage(cfg.replay_buffer.size, device=cfg.device),
+        batch_size=cfg.optim.minibatch_size,
     )
     run = Run(
         cfg,

@@ -54,6 +54,7 @@ class TestEveryConfiguration:
     [
         ("seed", -1, "seed must be an integer of at least 0, got -1"),
         ("seed", True, "seed must be an integer of at least 0, got True"),
+        ("device", "cuda:99", r"device must be one of 'cpu'.*got 'cuda:99'"),
         ("num_threads", 1.5, "num_threads must be an integer of at least 1, got 1.5"),
         ("env.robot", "unicycle", "env.robot must be one of 'point'.*got 'unicycle'"),
         ("loss.risk_level", 2, r"loss.risk_level must be a number in \(0, 1\], got 2"),
@@ -79,6 +80,13 @@ def test_message(name, value, message):
         OmegaConf.update(cfg, name, value)
     with pytest.raises(ValueError, match=message):
         config.check_config(cfg)
+
+
+def test_memmap_is_for_the_cpu(monkeypatch):
+    monkeypatch.setitem(config.RULES, "device", config.NAME)  # as where there is a GPU
+    config.check_config(compose("safetac_point", "device=cuda"))
+    with pytest.raises(ValueError, match=r"memmap keeps the replay on the CPU.*got 'cuda'"):
+        config.check_config(compose("safetac_point", "device=cuda", "replay_buffer.storage=memmap"))
 
 
 @pytest.mark.parametrize("backend", ["wandb", "tensorboard"])

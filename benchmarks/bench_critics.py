@@ -1,0 +1,113 @@
+"""A round of the critics' gradient steps: the example's way, and others."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import hydra
+import pytest
+import torch
+import torch.nn.functional as F
+from critics import make_critic_optim, make_losses, minibatches
+from descent import Descent
+from omegaconf import DictConfig
+from tensordict import TensorDict, TensorDictBase
+from torch import nn
+from utils import make_policy
+
+from torchrl_safe.envs import SafeGoalEnv
+
+EXAMPLES = Path(__file__).resolve().parents[1] / "examples"
+
+
+def make_data(num_frames: int, observation_dim: int, action_dim: int) -> TensorDict:
+    targets = torch.rand(3, num_frames, 1)
+    return TensorDict(
+        {
+            "observation": torch.randn(num_frames, observation_dim),
+            "action": torch.rand(num_frames, action_dim) * 2 - 1,
+            **dict(zip(("value_target", "cost_target", "std_target"), targets, strict=True)),
+        },
+        [num_frames],
+    )
+
+
+def with_losses(
+    cfg: DictConfig, env: SafeGoalEnv, data: TensorDict, vmap: bool, compiled: bool = False
+) -> Callable[[], None]:
+    """The losses of the library, over networks one by one or by vmap."""
+    reward_loss, cost_loss = make_losses(cfg, env, make_policy(cfg, env))
+    for loss in (reward_loss, cost_loss):
+        loss.deactivate_vmap = not vmap
+        loss._make_vmap()
+    descent = Descent(cfg, make_critic_optim(cfg, reward_loss, cost_loss))
+
+    def losses_of(minibatch: TensorDictBase) -> TensorDictBase:
+        losses = cost_loss(minibatch)
+        losses["loss_qvalue"], _ = reward_loss.qvalue_v2_loss(minibatch)
+        return losses
+
+    if compiled:
+        losses_of = torch.compile(losses_of)
+
+    def one_round() -> None:
+        for minibatch in minibatches(data, cfg.optim.minibatch_size):
+            descent.step(losses_of(minibatch))
+
+    return one_round
+
+
+def plain(cfg: DictConfig, env: SafeGoalEnv, data: TensorDict) -> Callable[[], None]:
+    """PyTorch without losses and tensordicts: what the same arithmetic costs at least."""
+
+    def network(*last: nn.Module) -> nn.Sequential:
+        sizes = [data["observation"].shape[-1] + data["action"].shape[-1], *cfg.critic.num_cells]
+        hidden = (
+            layer
+            for pair in itertools.pairwise(sizes)
+            for layer in (nn.Linear(*pair), nn.ReLU(inplace=True))
+        )
+        return nn.Sequential(*hidden, nn.Linear(sizes[-1], 1), *last)
+
+    networks = [network(), network(), network(), network(nn.Softplus())]
+    params = [p for each in networks for p in each.parameters()]
+    optim = torch.optim.Adam(params, lr=cfg.optim.critic_lr, fused=True)
+    inputs = torch.cat([data["observation"], data["action"]], -1)
+    targets = [data[name] for name in ("value_target", "value_target", "cost_target", "std_target")]
+
+    def one_round() -> None:
+        order = torch.randperm(len(inputs))
+        batches = [tensor[order].split(cfg.optim.minibatch_size) for tensor in (inputs, *targets)]
+        for batch, *wanted in zip(*batches, strict=True):
+            pairs = zip(networks, wanted, strict=True)
+            loss = torch.stack([F.mse_loss(each(batch), target) for each, target in pairs]).sum()
+            optim.zero_grad()
+            loss.backward()
+            nn.utils.clip_grad_norm_(params, cfg.optim.max_grad_norm)
+            optim.step()
+
+    return one_round
+
+
+@pytest.mark.parametrize("how", ["losses", "losses_vmap", "losses_compiled", "plain"])
+@pytest.mark.parametrize("width", [64, 128, 256], ids="{0}-{0}".format)
+def bench_round(benchmark: Any, width: int, how: str) -> None:
+    """One round, from targets to the last gradient step."""
+    torch.manual_seed(0)
+    with hydra.initialize_config_dir(str(EXAMPLES), version_base="1.3"):
+        cfg = hydra.compose("safetac_point", [f"critic.num_cells=[{width},{width}]"])
+    env = SafeGoalEnv(num_envs=1, num_threads=1)
+    data = make_data(cfg.optim.critic_frames, 24, env.action_spec.shape[-1])
+    benchmark.group = (
+        f"critics {width}-{width}, {len(data):,} frames in steps of {cfg.optim.minibatch_size:,}"
+    )
+    if how == "plain":
+        one_round = plain(cfg, env, data)
+    else:
+        one_round = with_losses(
+            cfg, env, data, vmap=how == "losses_vmap", compiled=how == "losses_compiled"
+        )
+    benchmark.pedantic(one_round, rounds=5, warmup_rounds=2)

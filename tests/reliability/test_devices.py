@@ -1,0 +1,221 @@
+"""Nothing is tied to the CPU: on a GPU the numbers are the same, and the host does not wait.
+
+The tests marked ``gpu`` need one. ``test_host_sync.py`` counts what would make the host wait
+without one.
+"""
+
+from __future__ import annotations
+
+import warnings
+
+import critics
+import pytest
+import torch
+import utils
+from policy_steps import policy_kl
+from tensordict import TensorDict
+from tiny import config
+from torch import nn
+from torchrl.data import Bounded
+from torchrl.modules import MLP, ValueOperator
+
+from torchrl_safe import (
+    CVaRCostLoss,
+    GMMTanhPolicy,
+    TrustRegionSafeOptimizer,
+    TsallisLoss,
+)
+from torchrl_safe.objectives.value import with_policy
+
+OBS, ACT = 3, 2
+gpu = [
+    pytest.mark.gpu,
+    pytest.mark.skipif(not torch.cuda.is_available(), reason="there is no CUDA device"),
+]
+GPU = pytest.param("cuda", marks=gpu)
+
+
+def make_critic(key: str, *last: nn.Module) -> ValueOperator:
+    net = MLP(OBS + ACT, 1, num_cells=[16]).extend(last)
+    return ValueOperator(net, in_keys=["observation", "action"], out_keys=[key]).double()
+
+
+def make_blocks(device: str) -> tuple[GMMTanhPolicy, TsallisLoss, CVaRCostLoss]:
+    """The same blocks on every device."""
+    torch.manual_seed(0)
+    net = MLP(OBS, 3 * (1 + 2 * ACT), num_cells=[16])
+    spec = Bounded(-1, 1, (ACT,), dtype=torch.float64)
+    policy = GMMTanhPolicy(net, spec, num_components=3).double().to(device)
+    reward_loss = TsallisLoss(
+        policy,
+        make_critic("state_action_value").to(device),
+        alpha_init=0.1,
+        fixed_alpha=True,
+        delay_qvalue=False,
+    )
+    reward_loss.make_value_estimator("retrace", gamma=0.9, lmbda=0.8)
+    cost_loss = CVaRCostLoss(
+        policy,
+        make_critic("cost_value").to(device),
+        make_critic("cost_std", nn.Softplus()).to(device),
+        cost_limit=1.0,
+    )
+    cost_loss.make_value_estimator(gamma=0.9, lmbda=0.8)
+    return policy, reward_loss, cost_loss
+
+
+def make_data(batch: tuple[int, int] = (6, 7)) -> TensorDict:
+    """Trajectories with the draws of the policy in them, which differ between devices."""
+    generator = torch.Generator().manual_seed(1)
+
+    def rand(*shape: int) -> torch.Tensor:
+        return torch.randn(*batch, *shape, generator=generator, dtype=torch.float64)
+
+    done = rand(1) > 1
+    data = TensorDict(
+        {
+            "observation": rand(OBS),
+            "action": rand(ACT).tanh(),
+            "action_log_prob": rand(),
+            "next": {
+                "observation": rand(OBS),
+                "reward": rand(1),
+                "cost": rand(1).sigmoid(),
+                "done": done,
+                "terminated": done & (rand(1) > 0),
+            },
+        },
+        batch,
+    )
+    torch.manual_seed(2)
+    return with_policy(data, make_blocks("cpu")[0])
+
+
+def make_closure(policy, reward_loss, cost_loss, states, noise):
+    """Noise is given, since generators of two devices differ."""
+
+    def closure() -> TensorDict:
+        dist = policy.get_dist(states)
+        action, log_prob = dist.rsample_and_log_prob(noise=noise)
+        mean, cov = dist.moments
+        return TensorDict(
+            objective=reward_loss.objective(states, action, log_prob).mean(),
+            constraint=cost_loss.constraint(states, action)[None],
+            statistics=TensorDict(mean=mean, cov=cov),
+        )
+
+    return closure
+
+
+def learn(device: str) -> dict[str, torch.Tensor]:
+    """What every block gives on a device."""
+    policy, reward_loss, cost_loss = make_blocks(device)
+    data = make_data().to(device)
+    dist = policy.get_dist(data)
+    noise = make_blocks("cpu")[0].get_dist(make_data()).draw_noise()
+    noise = torch.utils._pytree.tree_map_only(torch.Tensor, lambda x: x.to(device), noise)
+    out = {"log_prob": dist.log_prob(data["action"]), "action": dist.rsample(noise=noise)}
+    out["mean"], out["cov"] = dist.moments
+    out["reward_target"] = reward_loss.compute_target(data)
+    out["cost_target"], out["std_target"] = cost_loss.compute_target(data)
+    losses = cost_loss(data)
+    losses["loss_qvalue"], _ = reward_loss.qvalue_v2_loss(data)
+    sum(losses[f"loss_{name}"] for name in ("qvalue", "cost_value", "cost_std")).backward()
+    for name, params in (
+        ("qvalue", reward_loss.qvalue_network_params),
+        ("cost", cost_loss.cost_network_params),
+        ("std", cost_loss.std_network_params),
+    ):
+        out |= {f"{name} {i}": p.grad for i, p in enumerate(params.parameters())}
+    states = data.select("observation")
+    optim = TrustRegionSafeOptimizer(policy.parameters(), max_kl=0.01, statistics_kl=policy_kl)
+    report = optim.step(make_closure(policy, reward_loss, cost_loss, states, noise))
+    assert report.accepted, report
+    return out | {f"weight {i}": p for i, p in enumerate(policy.parameters())}
+
+
+@pytest.mark.parametrize("device", [GPU])
+def test_numbers_are_those_of_the_cpu(device):
+    expected, actual = learn("cpu"), learn(device)
+    for name, value in expected.items():
+        assert actual[name].device.type == device
+        torch.testing.assert_close(actual[name].cpu(), value, rtol=1e-8, atol=1e-10, msg=name)
+
+
+@pytest.mark.parametrize("device", [GPU])
+def test_host_does_not_wait_for_critics(device):
+    """Targets, losses, gradients and a step of Adam, queued without a look at any value."""
+    policy, reward_loss, cost_loss = make_blocks(device)
+    data = make_data().to(device)
+    critics_params = [
+        *reward_loss.qvalue_network_params.parameters(),
+        *cost_loss.cost_network_params.parameters(),
+        *cost_loss.std_network_params.parameters(),
+    ]
+    optim = torch.optim.Adam(critics_params, fused=True)
+
+    def update() -> None:
+        part = with_policy(data, policy)
+        part.set("value_target", reward_loss.compute_target(part))
+        cost_target, std_target = cost_loss.compute_target(part)
+        part.update({"cost_target": cost_target, "std_target": std_target})
+        losses = cost_loss(part)
+        loss = losses["loss_cost_value"] + losses["loss_cost_std"]
+        optim.zero_grad()
+        (loss + reward_loss.qvalue_v2_loss(part)[0]).backward()
+        optim.step()
+
+    update()  # settles what is settled once
+    torch.cuda.set_sync_debug_mode("error")
+    try:
+        update()
+    finally:
+        torch.cuda.set_sync_debug_mode("default")
+
+
+@pytest.mark.parametrize("device", [GPU])
+def test_host_waits_for_the_line_search_alone(device):
+    """As often after twenty conjugate-gradient iterations as after two."""
+    waits = {}
+    for iterations in (2, 20):
+        policy, reward_loss, cost_loss = make_blocks(device)
+        states = make_data().to(device).select("observation")
+        noise = policy.get_dist(states).draw_noise()
+        optim = TrustRegionSafeOptimizer(
+            policy.parameters(), max_kl=1e-4, cg_iters=iterations, statistics_kl=policy_kl
+        )
+        closure = make_closure(policy, reward_loss, cost_loss, states, noise)
+        optim.step(closure)
+        torch.cuda.set_sync_debug_mode("warn")
+        try:
+            with warnings.catch_warnings(record=True) as caught:
+                warnings.simplefilter("always")
+                report = optim.step(closure)
+        finally:
+            torch.cuda.set_sync_debug_mode("default")
+        candidates = report.backtracks + 1
+        waits[iterations] = len([w for w in caught if "synchroniz" in str(w.message)]), candidates
+    assert waits[2] == waits[20], waits
+
+
+def test_networks_and_replay_of_the_example(tmp_path):
+    """They are made on ``device``; ``meta`` stands in for a GPU."""
+    cfg = config(tmp_path)
+    env = utils.make_env(cfg, 2, seed=0)
+    assert env.device == torch.device("cpu")
+    cfg.device = "meta"
+    networks = utils.make_policy(cfg, env), utils.make_critic(cfg, env, "cost_value")
+    assert all(p.is_meta for network in networks for p in network.parameters())
+    assert critics.make_buffer(cfg).storage.device == torch.device("meta")
+    cfg.device = "cpu"
+    assert not any(p.is_meta for p in utils.make_policy(cfg, env).parameters())
+
+
+def test_minibatches_are_drawn_where_the_data_is():
+    data = TensorDict(x=torch.arange(10.0), batch_size=[10])
+    parts = list(critics.minibatches(data, 4))
+    assert [len(part) for part in parts] == [4, 4, 2]
+    assert torch.cat([part["x"] for part in parts]).sort().values.equal(data["x"])
+    assert not torch.cat([part["x"] for part in parts]).equal(data["x"])
+    (part,) = critics.minibatches(data.to("meta"), 10)  # an order on the CPU would raise
+    assert part["x"].is_meta

@@ -63,6 +63,8 @@ class TestQLogarithm:
         # Density 1/4 on a volume of 4: S_2 = -E[1/4 - 1].
         assert uniform_tsallis_entropy(math.log(4), 2.0) == pytest.approx(0.75)
         assert uniform_tsallis_entropy(-3.0, 1.0) == -3.0
+        expected = -exact_q_logarithm(-1.7, 1.4)
+        assert uniform_tsallis_entropy(1.7, 1.4) == pytest.approx(expected, rel=1e-13)
 
 
 class TestCVaR:
@@ -96,6 +98,8 @@ class TestUnits:
         gamma, rate = 0.97, 0.04
         total = sum(rate * gamma**t for t in range(3_000))
         assert discounted_cost_limit(rate, gamma) == pytest.approx(total)
+        assert discounted_cost_limit(rate, 0.0) == rate
+        assert discounted_cost_limit(0.0, gamma) == 0
 
     @pytest.mark.parametrize(
         ("rate", "gamma"), [(-1.0, 0.9), (math.nan, 0.9), (1.0, 1.0), (1.0, -0.1)]
@@ -152,11 +156,13 @@ class TestSurrogateChange:
 
 
 class TestMomentMatchedKL:
-    def test_multivariate_normal(self):
+    @pytest.mark.parametrize("dim", [1, 2, 3])
+    @pytest.mark.parametrize("batch", [(), (7,), (4, 5)])
+    def test_multivariate_normal(self, batch, dim):
         torch.manual_seed(0)
-        mean = torch.randn(2, 7, 3, dtype=torch.float64)
-        root = torch.randn(2, 7, 3, 3, dtype=torch.float64)
-        cov = root @ root.mT + 0.1 * torch.eye(3, dtype=torch.float64)
+        mean = torch.randn(2, *batch, dim, dtype=torch.float64)
+        root = torch.randn(2, *batch, dim, dim, dtype=torch.float64)
+        cov = root @ root.mT + 0.1 * torch.eye(dim, dtype=torch.float64)
         expected = kl_divergence(
             MultivariateNormal(mean[0], cov[0]), MultivariateNormal(mean[1], cov[1])
         )

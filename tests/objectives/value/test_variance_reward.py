@@ -9,11 +9,13 @@ import torch
 from test_retrace_functional import RandomMDP
 from torch import Tensor
 
-from torchrl_safe.objectives.value import retrace_variance_reward
+from torchrl_safe.objectives.value import retrace_variance_reward, squared_td_error
+
+REWARDS = pytest.mark.parametrize("reward", [retrace_variance_reward, squared_td_error])
 
 
-def variance_reward(mdp: RandomMDP, mean: Tensor) -> Tensor:
-    return retrace_variance_reward(
+def variance_reward(mdp: RandomMDP, mean: Tensor, reward=retrace_variance_reward) -> Tensor:
+    return reward(
         mdp.gamma,
         mdp.stored_cost(),
         mean[mdp.state, mdp.action],
@@ -30,15 +32,16 @@ def mdp(request: pytest.FixtureRequest) -> RandomMDP:
     return mdp
 
 
+@REWARDS
 @pytest.mark.parametrize("lmbda", [0.0, 0.7, 1.0])
-def test_mdp_fixed_point(mdp: RandomMDP, lmbda: float) -> None:
+def test_mdp_fixed_point(mdp: RandomMDP, lmbda: float, reward) -> None:
     """Off-policy, the exact mean and variance of the cost sum are their own expected targets."""
     garbage = 1e3
     mean = mdp._with_terminal(mdp.mean[:-1], garbage)
     variance = mdp._with_terminal(mdp.variance[:-1], garbage)
     target = mdp.expected_target(mdp.gamma, lmbda, mean, mdp.stored_cost())
     torch.testing.assert_close(target, mdp.mean[:-1].flatten())
-    target = mdp.expected_target(mdp.gamma**2, lmbda, variance, variance_reward(mdp, mean))
+    target = mdp.expected_target(mdp.gamma**2, lmbda, variance, variance_reward(mdp, mean, reward))
     torch.testing.assert_close(target, mdp.variance[:-1].flatten())
 
 
@@ -77,10 +80,13 @@ def test_variance_reward_masks_the_bootstrap() -> None:
     terminated = torch.tensor([[True], [False]])
     reward = retrace_variance_reward(0.5, cost, value, next_value, terminated)
     assert reward.squeeze(-1).tolist() == [9 - 4, 25 - 4]
+    reward = squared_td_error(0.5, cost, value, next_value, terminated)
+    assert reward.squeeze(-1).tolist() == [(3 - 2) ** 2, (3 + 2 - 2) ** 2]
 
 
+@REWARDS
 @pytest.mark.parametrize("name", ["action_value", "next_action_value", "terminated"])
-def test_variance_reward_checks(name: str) -> None:
+def test_variance_reward_checks(name: str, reward) -> None:
     inputs = {
         "cost": torch.ones(3, 1),
         "action_value": torch.ones(3, 1),
@@ -88,8 +94,8 @@ def test_variance_reward_checks(name: str) -> None:
         "terminated": torch.zeros(3, 1, dtype=torch.bool),
     }
     with pytest.raises(ValueError, match=rf"{name} must have shape \(3, 1\)"):
-        retrace_variance_reward(0.9, **{**inputs, name: inputs[name][:2]})
+        reward(0.9, **{**inputs, name: inputs[name][:2]})
     with pytest.raises(ValueError, match="gamma must be in"):
-        retrace_variance_reward(1.5, **inputs)
+        reward(1.5, **inputs)
     with pytest.raises(TypeError, match="terminated must be boolean"):
-        retrace_variance_reward(0.9, **{**inputs, "terminated": inputs["cost"]})
+        reward(0.9, **{**inputs, "terminated": inputs["cost"]})

@@ -18,7 +18,7 @@ from torch import nn
 from torchrl.data import Bounded, Composite
 from torchrl.envs import Transform, TransformedEnv
 from torchrl.modules import MLP, ValueOperator
-from torchrl.trainers import LogScalar
+from torchrl.trainers import LogScalar, Trainer
 
 from torchrl_safe import CVaRCostLoss, GMMTanhPolicy
 from torchrl_safe.objectives.functional import discounted_cost_limit
@@ -48,12 +48,17 @@ class ConstrainedStepper(TRPOStepper):
             policy,
             ValueOperator(mean, in_keys=["observation", "action"], out_keys=["cost_value"]),
             ValueOperator(std, in_keys=["observation", "action"], out_keys=["cost_std"]),
-            cost_limit=discounted_cost_limit(limit, gamma=0.98),
+            cost_limit=discounted_cost_limit(limit, gamma=0.99),
             risk_level=1.0,  # the mean; 0.1 would be the worst tenth of outcomes
         )
-        self.cost_loss.make_value_estimator(gamma=0.98, lmbda=0.95)
+        self.cost_loss.make_value_estimator(gamma=0.99, lmbda=0.95)
         nets = self.cost_loss.cost_network_params, self.cost_loss.std_network_params
         self.cost_optim = torch.optim.Adam([p for n in nets for p in n.parameters()], lr=3e-3)
+
+    def step(self, trainer: Trainer, batch: TensorDictBase) -> TensorDictBase:
+        """Steps that shrink: along a boundary, large ones leap from side to side."""
+        self.policy_optim.param_groups[0]["max_kl"] *= 0.96
+        return super().step(trainer, batch)
 
     def fit_critics(self, batch: TensorDictBase) -> None:
         """Those of the cost, too."""

@@ -6,24 +6,29 @@ python examples/compose_tsallis.py --entropic-index 1.4   # 1 is SAC itself; abo
 from __future__ import annotations
 
 import argparse
+from typing import Any
 
 import torch
 from tensordict.nn import NormalParamExtractor, TensorDictModule
 from torch import nn
 from torchrl.collectors import Collector
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
-from torchrl.envs import GymEnv, RewardSum, TransformedEnv
+from torchrl.envs import EnvBase, GymEnv, RewardSum, TransformedEnv
 from torchrl.modules import MLP, ProbabilisticActor, TanhNormal, ValueOperator
-from torchrl.objectives import SoftUpdate
+from torchrl.objectives import SACLoss, SoftUpdate
 
 from torchrl_safe import TsallisLoss
 
 
-def train(entropic_index: float, seed: int, total_frames: int) -> list[tuple[int, float]]:
-    """Train, and return (frames, return) of every training episode."""
-    torch.manual_seed(seed)
+def make_env(seed: int) -> EnvBase:
+    """The pendulum, with the return of its episodes."""
     env = TransformedEnv(GymEnv("Pendulum-v1"), RewardSum())
     env.set_seed(seed)
+    return env
+
+
+def make_networks(env: EnvBase, **kwargs: Any) -> tuple[ProbabilisticActor, ValueOperator]:
+    """SAC's actor and critic."""
     network = MLP(3, 2, num_cells=[64, 64])
     actor = ProbabilisticActor(
         TensorDictModule(
@@ -33,21 +38,17 @@ def train(entropic_index: float, seed: int, total_frames: int) -> list[tuple[int
         spec=env.action_spec,
         distribution_class=TanhNormal,
         distribution_kwargs={"low": -2.0, "high": 2.0, "tanh_loc": False},
+        **kwargs,
     )
-    qvalue = ValueOperator(MLP(4, 1, num_cells=[64, 64]), in_keys=["observation", "action"])
-    loss_module = TsallisLoss(actor, qvalue, entropic_index=entropic_index)  # was: SACLoss(...)
-    loss_module.make_value_estimator(gamma=0.98)
+    return actor, ValueOperator(MLP(4, 1, num_cells=[64, 64]), in_keys=["observation", "action"])
+
+
+def learn(
+    collector: Collector, buffer: TensorDictReplayBuffer, loss_module: SACLoss
+) -> list[tuple[int, float]]:
+    """One gradient step per frame after the first 1,000: (frames, return) of every episode."""
     target_updater = SoftUpdate(loss_module, tau=0.01)
     optim = torch.optim.Adam(loss_module.parameters(), lr=1e-3)
-    buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(total_frames), batch_size=128)
-    collector = Collector(
-        env,
-        actor,
-        frames_per_batch=50,
-        total_frames=total_frames,
-        init_random_frames=1000,
-        auto_register_policy_transforms=False,
-    )
     episodes, frames = [], 0
     for batch in collector:
         frames += batch.numel()
@@ -62,6 +63,19 @@ def train(entropic_index: float, seed: int, total_frames: int) -> list[tuple[int
             target_updater.step()
     collector.shutdown()
     return episodes
+
+
+def train(entropic_index: float, seed: int, total_frames: int) -> list[tuple[int, float]]:
+    """Train, and return (frames, return) of every training episode."""
+    torch.manual_seed(seed)
+    env = make_env(seed)
+    actor, qvalue = make_networks(env)
+    loss_module = TsallisLoss(actor, qvalue, entropic_index=entropic_index)  # was: SACLoss(...)
+    loss_module.make_value_estimator(gamma=0.98)
+    buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(total_frames), batch_size=128)
+    budget = {"frames_per_batch": 50, "total_frames": total_frames, "init_random_frames": 1000}
+    collector = Collector(env, actor, **budget, auto_register_policy_transforms=False)
+    return learn(collector, buffer, loss_module)
 
 
 if __name__ == "__main__":

@@ -8,9 +8,12 @@ A trained policy, in two lines::
 
 from __future__ import annotations
 
+import contextlib
+import io
 import json
 import os
 import signal
+import sys
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -194,6 +197,16 @@ def train(
     final_env.close()
 
 
+@contextlib.contextmanager
+def nobody_to_ask() -> Iterator[None]:
+    """No terminal to read from: wandb, asked to be online without an account, fails at once."""
+    terminal, sys.stdin = sys.stdin, io.StringIO()
+    try:
+        yield
+    finally:
+        sys.stdin = terminal
+
+
 class Counters(dict):
     """Plain numbers of a run that a checkpoint keeps."""
 
@@ -267,14 +280,16 @@ class Run:
                     f"the run in run_dir={cfg.run_dir} has {self.frames} frames."
                 )
         self.path.mkdir(parents=True, exist_ok=True)
-        write_atomically(self.path / "config.yaml", OmegaConf.to_yaml(cfg, resolve=True))
         os.environ.setdefault("WANDB_MODE", "offline")
-        self.logger = get_logger(
-            cfg.logger.backend,
-            logger_name=str(self.path),
-            experiment_name="log",
-            wandb_kwargs={"project": cfg.logger.project_name, "dir": str(self.path)},
-        )
+        with nobody_to_ask():
+            self.logger = get_logger(
+                cfg.logger.backend,
+                logger_name=str(self.path),
+                experiment_name="log",
+                wandb_kwargs={"project": cfg.logger.project_name, "dir": str(self.path)},
+            )
+        # Last: where the log cannot be opened, there is no run.
+        write_atomically(self.path / "config.yaml", OmegaConf.to_yaml(cfg, resolve=True))
 
     @property
     def frames(self) -> int:

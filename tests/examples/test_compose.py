@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import compose_constraint
+import compose_retrace
 import compose_tsallis
 import pytest
 import torch
@@ -33,6 +34,23 @@ def test_tsallis():
     episodes = compose_tsallis.train(entropic_index=1.4, seed=0, total_frames=1_050)
     assert [frames for frames, _ in episodes] == [200, 400, 600, 800, 1000]
     assert all(-2_000 < episode_return < 0 for _, episode_return in episodes)
+
+
+def test_retrace(monkeypatch):
+    """The targets that SACLoss regresses on are those of the estimator, slice by slice."""
+    seen = []
+    estimate = compose_retrace.RetraceEstimator.value_estimate
+
+    def spy(self, tensordict, *args, **kwargs):
+        seen.append(tensordict)
+        return estimate(self, tensordict, *args, **kwargs)
+
+    monkeypatch.setattr(compose_retrace.RetraceEstimator, "value_estimate", spy)
+    episodes = compose_retrace.train(lmbda=0.9, seed=0, total_frames=1_050)
+    assert [frames for frames, _ in episodes] == [200, 400, 600, 800, 1000]
+    assert len(seen) == 50
+    assert all((sample["action_log_prob"] != 0).all() for sample in seen)
+    assert all(sample["next", "done"].view(-1, 8)[:, -1].all() for sample in seen)  # cut there
 
 
 def test_trpo(policy, tmp_path):

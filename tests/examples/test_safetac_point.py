@@ -1,8 +1,10 @@
 from __future__ import annotations
 
+import contextlib
 import itertools
 import json
 import os
+import pty
 import signal
 import subprocess
 import sys
@@ -210,6 +212,32 @@ class TestLoggers:
         assert result.returncode == 0, result.stderr
         assert list((tmp_path / "run").rglob("offline-run-*"))
         assert (tmp_path / "run" / "video.mp4").exists() or "no video" in result.stdout
+
+    def test_online_without_an_account_asks_nothing(self, tmp_path):
+        """On a terminal, where wandb would offer to make an account, and wait."""
+        env = {k: v for k, v in os.environ.items() if not k.startswith("WANDB")}
+        env |= {"WANDB_MODE": "online", "HOME": str(tmp_path), "TERM": "xterm"}
+        backend = ["logger.backend=wandb"]
+        ours, terminal = pty.openpty()
+        process = subprocess.Popen(
+            [sys.executable, EXAMPLES / "safetac_point.py", "run_dir=run", *TINY, *backend],
+            stdin=terminal,
+            stdout=terminal,
+            stderr=terminal,
+            env=env,
+            cwd=tmp_path,
+        )
+        os.close(terminal)
+        said = b""
+        with contextlib.suppress(OSError):  # how Linux says that nobody holds the terminal any more
+            while b"choice" not in said and (more := os.read(ours, 1024)):
+                said += more
+        os.close(ours)
+        process.kill()
+        process.wait()
+        assert b"choice" not in said
+        assert b"wandb login" in said
+        assert not (tmp_path / "run" / "config.yaml").exists()
 
 
 class TestMisuse:

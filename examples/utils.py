@@ -8,7 +8,6 @@ A trained policy, in two lines::
 
 from __future__ import annotations
 
-import contextlib
 import io
 import json
 import os
@@ -197,7 +196,7 @@ def train(
     final_env.close()
 
 
-@contextlib.contextmanager
+@contextmanager
 def nobody_to_ask() -> Iterator[None]:
     """No terminal to read from: wandb, asked to be online without an account, fails at once."""
     terminal, sys.stdin = sys.stdin, io.StringIO()

@@ -45,6 +45,9 @@ BASE = [
 ]
 NUM_UPDATES = 3  # measured, after one that warms up
 PARTS = ("collect and other", "targets", "critics", "policy")
+COLOURS = dict(
+    zip((*PARTS, "sample"), ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#888888"), strict=True)
+)
 AXES: dict[str, list[int]] = {
     "environments": [25, 100, 400, 1600],
     "worker processes": [1, 2, 4],
@@ -139,14 +142,16 @@ def plot() -> None:
         for part in parts:
             cost = {int(row["value"]): float(row["us"]) for row in mine if row["part"] == part}
             height = np.array([cost[value] for value in values])
-            axes.bar([f"{value:,}" for value in values], height, 0.7, bottom, label=part)
+            names = [f"{value:,}" for value in values]
+            axes.bar(names, height, 0.7, bottom, label=part, color=COLOURS[part])
             bottom += height
         axes.set_xlabel(axis)
         axes.spines[["top", "right"]].set_visible(False)
     first, *_, last = figure.axes
     first.set_ylabel("microseconds per frame")
     last.set_ylabel("per replayed frame")
-    first.legend(frameon=False, fontsize="small")
+    legend = first.get_legend_handles_labels()
+    figure.legend(*legend, loc="outside upper center", ncols=len(PARTS), frameon=False)
     PICTURE.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(PICTURE, dpi=120)
 

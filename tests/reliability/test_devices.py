@@ -7,6 +7,7 @@ without one.
 from __future__ import annotations
 
 import warnings
+from collections.abc import Callable
 
 import critics
 import pytest
@@ -14,6 +15,7 @@ import torch
 import utils
 from policy_steps import policy_kl
 from tensordict import TensorDict
+from test_host_sync import HostReads
 from tiny import config
 from torch import nn
 from torchrl.data import Bounded
@@ -142,17 +144,16 @@ def test_numbers_are_those_of_the_cpu(device):
         torch.testing.assert_close(actual[name].cpu(), value, rtol=1e-8, atol=1e-10, msg=name)
 
 
-@pytest.mark.parametrize("device", [GPU])
-def test_host_does_not_wait_for_critics(device):
-    """Targets, losses, gradients and a step of Adam, queued without a look at any value."""
+def make_critics_update(device: str) -> Callable[[], None]:
+    """Targets, losses, gradients and a step of Adam; what is settled once is settled."""
     policy, reward_loss, cost_loss = make_blocks(device)
     data = make_data().to(device)
-    critics_params = [
+    params = [
         *reward_loss.qvalue_network_params.parameters(),
         *cost_loss.cost_network_params.parameters(),
         *cost_loss.std_network_params.parameters(),
     ]
-    optim = torch.optim.Adam(critics_params, fused=True)
+    optim = torch.optim.Adam(params, fused=True)
 
     def update() -> None:
         part = with_policy(data, policy)
@@ -165,7 +166,20 @@ def test_host_does_not_wait_for_critics(device):
         (loss + reward_loss.qvalue_v2_loss(part)[0]).backward()
         optim.step()
 
-    update()  # settles what is settled once
+    update()
+    return update
+
+
+def test_critics_read_nothing():
+    update = make_critics_update("cpu")
+    with HostReads() as reads:
+        update()
+    assert reads.count == 0
+
+
+@pytest.mark.parametrize("device", [GPU])
+def test_host_does_not_wait_for_critics(device):
+    update = make_critics_update(device)
     torch.cuda.set_sync_debug_mode("error")
     try:
         update()

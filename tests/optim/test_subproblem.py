@@ -312,6 +312,18 @@ def test_rejections(q, s, c, reason):
     assert reason in solution.reason
 
 
+def test_products_that_no_vectors_have_are_rejected():
+    """A curvature that is not positive definite gives them, each diagonal entry positive."""
+    r, s = [0.4, 0.8], [[1.0, -0.55], [-0.55, 1.0]]
+    gram = np.block([[np.ones((1, 1)), np.array([r])], [np.array([r]).T, np.array(s)]])
+    assert np.linalg.eigvalsh(gram)[0] < -0.1
+    solution = solve_subproblem(1.0, r, s, [-0.8, -0.2], max_kl=0.5)
+    assert solution.case == "rejected"
+    assert solution.reason == "the curvature is not positive definite"
+    assert solution.objective_weight == 0
+    assert (solution.constraint_weight == 0).all()
+
+
 def test_opposite_violated_constraints_are_rejected():
     solution = solve_subproblem(1, [0, 0], [[1, -1], [-1, 1]], [0.5, 0.5], max_kl=0.5)
     assert solution.case == "rejected"

@@ -277,6 +277,6 @@ class SafeGoalEnv(EnvBase):
         return {**self.__dict__, "_renderer": None}
 
 
-def _column(value: NDArray[Any], dtype: DTypeLike = None) -> torch.Tensor:
+def _column(value: NDArray[Any], dtype: DTypeLike | None = None) -> torch.Tensor:
     """A copy of [N] as a tensor [N, 1]."""
     return torch.from_numpy(value[:, None].astype(dtype or value.dtype))

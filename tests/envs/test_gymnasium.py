@@ -210,7 +210,7 @@ class TestBadInput:
     def test_vector_constructor(self):
         with pytest.raises(ValueError, match="num_envs must be an integer >= 1, got 0"):
             make_vec(0)
-        with pytest.raises(ValueError, match="autoreset_mode must be one of .*got 'Later'"):
+        with pytest.raises(ValueError, match=r"autoreset_mode must be one of .*got 'Later'"):
             make_vec(autoreset_mode="Later")
 
     def test_reset(self):

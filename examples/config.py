@@ -107,7 +107,7 @@ def optional(rule: Rule) -> Rule:
     return Rule(lambda v: v is None or rule.holds(v), f"null or {rule.text}")
 
 
-BOOLEAN = one_of(True, False)
+BOOLEAN = Rule(lambda v: isinstance(v, bool), "one of True, False")  # 1 == True
 PATH = Rule(lambda v: isinstance(v, str) and v != "", "a path")
 NAME = Rule(lambda v: isinstance(v, str) and v != "", "a name")
 

@@ -444,10 +444,15 @@ def make_core(
         randomization (Randomization, optional): how the robots differ from their model.
 
     Raises:
+        TypeError: if the task or the randomization is something else.
         ValueError: if the robot is unknown, an option is out of range or the objects do not fit.
     """
-    if isinstance(robot, str):
+    if not isinstance(robot, Robot):
         robot = get_robot(robot)
+    if task is not None and (isinstance(task, type) or not hasattr(task, "sample")):
+        raise TypeError(f"task must be a task with its options, such as GoalTask(), got {task!r}.")
+    if randomization is not None and not isinstance(randomization, Randomization):
+        raise TypeError(f"randomization must be a Randomization or None, got {randomization!r}.")
     return Core(
         robot,
         TASKS[robot.task]() if task is None else task,

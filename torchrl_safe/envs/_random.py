@@ -13,6 +13,12 @@ _MIX_1 = np.uint64(0xBF58476D1CE4E5B9)
 _MIX_2 = np.uint64(0x94D049BB133111EB)
 
 
+def check_seed(name: str, seed: object) -> None:
+    """Raise a ``ValueError`` unless ``seed`` is None or an integer of at least 0."""
+    if seed is not None and (not isinstance(seed, (int, np.integer)) or seed < 0):
+        raise ValueError(f"{name} must be None or an integer >= 0, got {seed!r}.")
+
+
 class RandomStreams:
     """One stream of uniform numbers per environment.
 
@@ -24,7 +30,7 @@ class RandomStreams:
         num_streams (int): how many streams, N.
 
     Raises:
-        ValueError: if the seed is negative.
+        ValueError: if the seed is negative or no integer.
 
     Examples:
         >>> import numpy as np
@@ -35,8 +41,7 @@ class RandomStreams:
     """
 
     def __init__(self, seed: int | None, num_streams: int) -> None:
-        if seed is not None and seed < 0:
-            raise ValueError(f"seed must be None or an integer >= 0, got {seed}.")
+        check_seed("seed", seed)
         children = np.random.SeedSequence(seed).spawn(num_streams)
         self.state = np.array([c.generate_state(1, np.uint64)[0] for c in children], np.uint64)
 

@@ -16,6 +16,7 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from torchrl_safe.envs._core import Core, Frame, Mask, make_core
+from torchrl_safe.envs._random import check_seed
 from torchrl_safe.envs.randomization import Randomization
 from torchrl_safe.envs.robots import ROBOTS, Array, Robot
 from torchrl_safe.envs.tasks import Task
@@ -111,6 +112,7 @@ class GymGoalEnv(gymnasium.Env[NDArray[Any], NDArray[Any]]):
             ValueError: if the seed is negative or there are options.
         """
         _no_options(options)
+        check_seed("seed", seed)
         super().reset(seed=seed)
         if seed is not None:
             self._core.seed(seed)
@@ -254,6 +256,9 @@ class GymGoalVectorEnv(gymnasium.vector.VectorEnv[NDArray[Any], NDArray[Any], ND
         width: int = 480,
         height: int = 360,
     ) -> None:
+        modes = [mode.value for mode in AutoresetMode]
+        if autoreset_mode not in (*AutoresetMode, *modes):
+            raise ValueError(f"autoreset_mode must be one of {modes}, got {autoreset_mode!r}.")
         self.autoreset_mode = AutoresetMode(autoreset_mode)
         self._core = make_core(
             robot,
@@ -302,6 +307,7 @@ class GymGoalVectorEnv(gymnasium.vector.VectorEnv[NDArray[Any], NDArray[Any], ND
                 )
         if seed is not None and not isinstance(seed, (int, np.integer)):
             raise TypeError(f"seed must be one integer or None, got {seed!r}.")
+        check_seed("seed", seed)
         super().reset(seed=seed)
         if seed is not None:
             self._core.seed(seed)

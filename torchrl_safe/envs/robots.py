@@ -62,6 +62,9 @@ class Robot:
         footprint (tuple of float, optional): half the length and half the width in metres of the
             rectangle around the robot that must not touch anything, for tasks with obstacles.
 
+    Raises:
+        ValueError: if a number is out of its range.
+
     Examples:
         >>> get_robot("point").substeps
         10
@@ -79,6 +82,15 @@ class Robot:
     sense: Callable[[Array, Array, Array], Motion]
     task: str = "goal"
     footprint: tuple[float, float] | None = None
+
+    def __post_init__(self) -> None:
+        for name in ("timestep", "keepout"):
+            if not 0.0 < getattr(self, name) < np.inf:
+                raise ValueError(f"{name} must be positive and finite, got {getattr(self, name)}.")
+        for name in ("substeps", "action_dim"):
+            value = getattr(self, name)
+            if not isinstance(value, int) or value < 1:
+                raise ValueError(f"{name} must be an integer >= 1, got {value}.")
 
     @property
     def asset_path(self) -> Path:

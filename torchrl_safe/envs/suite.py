@@ -12,6 +12,7 @@ from dm_env import specs
 from numpy.typing import NDArray
 
 from torchrl_safe.envs._core import Core, make_core
+from torchrl_safe.envs._random import check_seed
 from torchrl_safe.envs._render import Scene
 from torchrl_safe.envs.randomization import Randomization
 from torchrl_safe.envs.robots import Array, Robot
@@ -144,9 +145,14 @@ class SafeTask(base.Task):
         core (Core): one environment.
         random (int, RandomState, optional): an integer seeds the episodes like every other face's
             ``seed``; from a ``RandomState``, also one put in later, their seed is drawn.
+
+    Raises:
+        ValueError: if the seed is negative.
     """
 
     def __init__(self, core: Core, random: int | np.random.RandomState | None) -> None:
+        if not isinstance(random, np.random.RandomState):
+            check_seed("random", random)
         super().__init__(random)
         self._core = core
         self._seeded_by: np.random.RandomState | None = None

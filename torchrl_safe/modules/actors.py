@@ -58,8 +58,8 @@ class GMMParamExtractor(nn.Module):
     ) -> None:
         super().__init__()
         for name, count in (("num_components", num_components), ("action_dim", action_dim)):
-            if count < 1:
-                raise ValueError(f"{name} must be at least 1, got {count}")
+            if not isinstance(count, int) or count < 1:
+                raise ValueError(f"{name}, an integer, must be at least 1, got {count}")
         low, high = log_std_bounds
         if not -math.inf < low < high < math.inf:
             raise ValueError(f"log_std_bounds must be finite and increasing, got {log_std_bounds}")
@@ -221,7 +221,10 @@ def _single_action_spec(spec: TensorSpec) -> Bounded:
         )
     low, high = spec.space.low, spec.space.high
     if not bool((low.isfinite() & high.isfinite() & (low < high)).all()):
-        raise ValueError(f"action_spec must have finite bounds with low < high, got {spec}")
+        raise ValueError(
+            "action_spec must have finite bounds with low < high, got "
+            f"low={low.tolist()} and high={high.tolist()}"
+        )
     single = spec[(0,) * (spec.ndim - 1)]
     if not bool((low == single.space.low).all() & (high == single.space.high).all()):
         raise ValueError(

@@ -112,11 +112,7 @@ class TanhGaussianMixture(Distribution):
         temperature: float = 0.5,
         validate_args: bool | None = None,
     ) -> None:
-        if loc.ndim < 2 or logits.shape != loc.shape[:-1] or scale.shape != loc.shape:
-            raise ValueError(
-                "expected logits of shape [*B, K] and loc, scale of shape [*B, K, D], got "
-                f"logits {tuple(logits.shape)}, loc {tuple(loc.shape)}, scale {tuple(scale.shape)}"
-            )
+        _check_shapes(logits, loc, scale)
         if relaxation not in get_args(Relaxation):
             raise ValueError(
                 f"relaxation must be one of {get_args(Relaxation)}, got {relaxation!r}"
@@ -361,6 +357,9 @@ def mixture_moments(logits: Tensor, loc: Tensor, scale: Tensor) -> tuple[Tensor,
     Returns:
         Mean ``[*B, D]`` and covariance ``[*B, D, D]``.
 
+    Raises:
+        ValueError: if shapes disagree.
+
     Examples:
         >>> import torch
         >>> mean, cov = mixture_moments(
@@ -369,6 +368,7 @@ def mixture_moments(logits: Tensor, loc: Tensor, scale: Tensor) -> tuple[Tensor,
         >>> mean, cov
         (tensor([0.]), tensor([[2.]]))
     """
+    _check_shapes(logits, loc, scale)
     logits, loc, scale = _components_first(logits, loc, scale)
     weights = logits.softmax(0).unsqueeze(1)
     mean = (weights * loc).sum(0)
@@ -377,6 +377,14 @@ def mixture_moments(logits: Tensor, loc: Tensor, scale: Tensor) -> tuple[Tensor,
     between = ((weights * centered).unsqueeze(2) * centered.unsqueeze(1)).sum(0)
     covariance = between.movedim((0, 1), (-2, -1)) + torch.diag_embed(variance.movedim(0, -1))
     return mean.movedim(0, -1), covariance
+
+
+def _check_shapes(logits: Tensor, loc: Tensor, scale: Tensor) -> None:
+    if loc.ndim < 2 or logits.shape != loc.shape[:-1] or scale.shape != loc.shape:
+        raise ValueError(
+            "expected logits of shape [*B, K] and loc, scale of shape [*B, K, D], got "
+            f"logits {tuple(logits.shape)}, loc {tuple(loc.shape)}, scale {tuple(scale.shape)}"
+        )
 
 
 def _components_first(logits: Tensor, loc: Tensor, scale: Tensor) -> tuple[Tensor, Tensor, Tensor]:

@@ -36,6 +36,10 @@ class DeterministicAction(nn.Module):
 
     def forward(self, *inputs: Tensor) -> Tensor:
         """The action ``[B, A]`` for the tensors ``[B, ...]`` of the policy's ``in_keys``."""
+        if len(inputs) != len(self.policy.in_keys):
+            raise ValueError(
+                f"inputs must be one tensor for each of {self.policy.in_keys}, got {len(inputs)}."
+            )
         batch = inputs[0].shape[:1]
         entries = dict(zip(self.policy.in_keys, inputs, strict=True))
         return self.policy.get_dist(TensorDict(entries, batch)).deterministic_sample

@@ -22,7 +22,7 @@ from torchrl.objectives.utils import (
 )
 from torchrl.objectives.value import ValueEstimatorBase
 
-from torchrl_safe.objectives.functional import check_risk_level, gaussian_cvar
+from torchrl_safe.objectives.functional import check_regression, check_risk_level, gaussian_cvar
 from torchrl_safe.objectives.value import (
     RetraceEstimator,
     retrace_variance_reward,
@@ -77,8 +77,8 @@ class CVaRCostLoss(LossModule):
         trajectories, and minibatches of single transitions drawn from them.
 
     Raises:
-        ValueError: if ``cost_limit`` is negative or not finite, or ``risk_level`` is outside
-            (0, 1].
+        ValueError: if ``cost_limit`` is negative or not finite, ``risk_level`` is outside
+            (0, 1], or another argument is out of its range.
 
     Examples:
         >>> import torch
@@ -181,6 +181,7 @@ class CVaRCostLoss(LossModule):
         use_prioritized_weights: bool | Literal["auto"] = "auto",
     ) -> None:
         check_risk_level(risk_level)
+        check_regression(loss_function, reduction)
         if not 0 <= cost_limit < float("inf"):
             raise ValueError(f"cost_limit must be finite and at least 0, got {cost_limit}.")
         if num_cost_nets < 1:

@@ -7,6 +7,7 @@ functions and add nothing to them.
 from __future__ import annotations
 
 import math
+from numbers import Real
 from statistics import NormalDist
 
 import torch
@@ -128,7 +129,7 @@ def gaussian_cvar(mean: Tensor, std: Tensor, risk_level: float) -> Tensor:
         The CVaR, ``[*B]``, in the unit of ``mean``.
 
     Raises:
-        ValueError: if ``risk_level`` is outside (0, 1].
+        ValueError: if shapes disagree or ``risk_level`` is outside (0, 1].
 
     Examples:
         >>> import torch
@@ -136,6 +137,10 @@ def gaussian_cvar(mean: Tensor, std: Tensor, risk_level: float) -> Tensor:
         >>> gaussian_cvar(torch.tensor(1.0), torch.tensor(2.0), risk_level=0.5)
         tensor(2.5958)
     """
+    if std.shape != mean.shape:
+        raise ValueError(
+            f"std must have the shape of mean, {tuple(mean.shape)}, got {tuple(std.shape)}."
+        )
     return mean + cvar_factor(risk_level) * std
 
 
@@ -233,6 +238,9 @@ def moment_matched_kl(
     Returns:
         ``KL(old || new)`` in nats, ``[*B]``.
 
+    Raises:
+        ValueError: if shapes disagree.
+
     Examples:
         >>> import torch
         >>> from torchrl_safe.objectives.functional import moment_matched_kl
@@ -240,6 +248,18 @@ def moment_matched_kl(
         >>> moment_matched_kl(mean, cov, mean + 1.0, cov)
         tensor(1.)
     """
+    mean_shape = tuple(old_mean.shape)
+    cov_shape = (*mean_shape, *mean_shape[-1:])
+    for name, tensor, shape in (
+        ("old_cov", old_cov, cov_shape),
+        ("new_mean", new_mean, mean_shape),
+        ("new_cov", new_cov, cov_shape),
+    ):
+        if tensor.shape != shape:
+            raise ValueError(
+                f"{name} must have shape {shape}, as old_mean's {mean_shape} says, got "
+                f"{tuple(tensor.shape)}."
+            )
     new_factor, old_factor = _cholesky(new_cov), _cholesky(old_cov)
     dim = range(old_mean.shape[-1])
     zero = torch.zeros_like(old_mean[..., 0])
@@ -280,11 +300,25 @@ def _solve_lower(factor: list[list[Tensor]], b: list[Tensor]) -> list[Tensor]:
 
 def check_entropic_index(entropic_index: float) -> None:
     """Raise a ``ValueError`` unless ``entropic_index`` is a positive finite number."""
-    if not 0 < entropic_index < math.inf:
-        raise ValueError(f"entropic_index must be a positive finite number, got {entropic_index}.")
+    if not (isinstance(entropic_index, Real) and 0 < entropic_index < math.inf):
+        raise ValueError(
+            f"entropic_index must be a positive finite number, got {entropic_index!r}."
+        )
 
 
 def check_risk_level(risk_level: float) -> None:
     """Raise a ``ValueError`` unless ``risk_level`` is in (0, 1]."""
-    if not 0 < risk_level <= 1:
-        raise ValueError(f"risk_level must be in (0, 1], got {risk_level}.")
+    if not (isinstance(risk_level, Real) and 0 < risk_level <= 1):
+        raise ValueError(f"risk_level must be in (0, 1], got {risk_level!r}.")
+
+
+def check_regression(loss_function: str, reduction: str) -> None:
+    """Raise a ``ValueError`` unless TorchRL has such a loss of a critic."""
+    for name, value, allowed in (
+        ("loss_function", loss_function, ("l1", "l2", "smooth_l1")),
+        ("reduction", reduction, ("none", "mean", "sum")),
+    ):
+        if value not in allowed:
+            raise ValueError(
+                f"{name} must be one of {', '.join(map(repr, allowed))}, got {value!r}."
+            )

@@ -221,8 +221,8 @@ class PIDMultiplier(nn.Module):
 
 
 def _check_count(num_constraints: int) -> None:
-    if num_constraints < 1:
-        raise ValueError(f"num_constraints must be at least 1, got {num_constraints}.")
+    if not isinstance(num_constraints, int) or num_constraints < 1:
+        raise ValueError(f"num_constraints, an integer, must be at least 1, got {num_constraints}.")
 
 
 def _checked(constraint: Tensor | Sequence[float], like: Tensor) -> Tensor:

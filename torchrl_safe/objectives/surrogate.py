@@ -14,7 +14,12 @@ from torch import Tensor
 from torchrl.objectives import LossModule, distance_loss
 from torchrl.objectives.value import ValueEstimatorBase
 
-from torchrl_safe.objectives.functional import check_risk_level, gaussian_cvar, surrogate_change
+from torchrl_safe.objectives.functional import (
+    check_regression,
+    check_risk_level,
+    gaussian_cvar,
+    surrogate_change,
+)
 from torchrl_safe.objectives.value import (
     RetraceEstimator,
     retrace_variance_reward,
@@ -231,6 +236,7 @@ class ReturnSurrogateLoss(_SurrogateLoss):
         loss_function: str = "l2",
         reduction: Literal["mean", "sum", "none"] = "mean",
     ) -> None:
+        check_regression(loss_function, reduction)
         super().__init__()
         self.convert_to_functional(value_network, "value_network", create_target_params=False)
         self.loss_function = loss_function
@@ -351,8 +357,8 @@ class CVaRSurrogateLoss(_SurrogateLoss):
         constraints are stacked.
 
     Raises:
-        ValueError: if ``cost_limit`` is negative or not finite, or ``risk_level`` is outside
-            (0, 1].
+        ValueError: if ``cost_limit`` is negative or not finite, ``risk_level`` is outside
+            (0, 1], or another argument is out of its range.
 
     Examples:
         >>> import torch
@@ -442,6 +448,7 @@ class CVaRSurrogateLoss(_SurrogateLoss):
         reduction: Literal["mean", "sum", "none"] = "mean",
     ) -> None:
         check_risk_level(risk_level)
+        check_regression(loss_function, reduction)
         if not 0 <= cost_limit < float("inf"):
             raise ValueError(f"cost_limit must be finite and at least 0, got {cost_limit}.")
         super().__init__()

@@ -17,6 +17,7 @@ from torchrl.objectives import SACLoss, distance_loss
 
 from torchrl_safe.objectives.functional import (
     check_entropic_index,
+    check_regression,
     q_logarithm,
     uniform_tsallis_entropy,
 )
@@ -74,7 +75,8 @@ class TsallisLoss(SACLoss):
         once on whole trajectories, and minibatches of single transitions drawn from them.
 
     Raises:
-        ValueError: if ``entropic_index`` is not a positive finite number.
+        ValueError: if ``entropic_index`` is not a positive finite number, or another argument is
+            out of its range.
 
     Examples:
         >>> import torch
@@ -148,6 +150,7 @@ class TsallisLoss(SACLoss):
         scalar_output_mode: Literal["exclude", "non_tensor"] | None = None,
     ) -> None:
         check_entropic_index(entropic_index)
+        check_regression(loss_function, reduction or "mean")
         if num_qvalue_nets < 1:
             raise ValueError(f"num_qvalue_nets must be at least 1, got {num_qvalue_nets}.")
         if not alpha_init > 0:

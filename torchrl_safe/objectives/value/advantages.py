@@ -663,7 +663,7 @@ def _discrete(action_space: str | TensorSpec | None) -> str | None:
     if name not in (None, "one_hot", "categorical"):
         raise ValueError(
             "action_space must be 'one-hot', 'categorical' or a spec of that kind, got "
-            f"{action_space}."
+            f"{action_space!r}."
         )
     return name
 

@@ -1,0 +1,1359 @@
+"""Every way to misuse the public API or a configuration: a message that helps, and nothing changed.
+
+Each case says what its message must name: the argument, the value it was given, and what is
+allowed. Whatever has a state is compared before and after, and so is the random state of torch.
+"""
+
+from __future__ import annotations
+
+import copy
+import math
+from collections.abc import Callable, Iterator
+from functools import cache, partial, reduce
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import config
+import gymnasium
+import hydra
+import numpy as np
+import pytest
+import torch
+from omegaconf import OmegaConf
+from tensordict import TensorDict
+from torch import nn
+from torch.utils._pytree import tree_leaves
+from torchrl.data import Bounded, Unbounded
+from torchrl.envs import GymEnv, TransformedEnv
+from torchrl.envs.utils import ExplorationType
+from torchrl.modules import MLP, ValueOperator
+from torchrl.objectives import SoftUpdate
+from torchrl.objectives.utils import ValueEstimators
+
+from torchrl_safe import (
+    CVaRCostLoss,
+    GMMTanhPolicy,
+    RetraceEstimator,
+    TanhGaussianMixture,
+    TrustRegionSafeOptimizer,
+    TsallisLoss,
+    envs,
+    record,
+)
+from torchrl_safe.envs import suite
+from torchrl_safe.modules import (
+    DeterministicAction,
+    GMMParamExtractor,
+    export_policy,
+    mixture_moments,
+)
+from torchrl_safe.objectives import (
+    CVaRSurrogateLoss,
+    LagrangeMultiplier,
+    PIDMultiplier,
+    ReturnSurrogateLoss,
+    lagrangian,
+    value,
+)
+from torchrl_safe.objectives import functional as F
+
+NAN, INF = math.nan, math.inf
+SPEC = Bounded(-1.0, 1.0, (2,))
+
+
+class Misuse(NamedTuple):
+    call: Callable[[], Any]
+    error: type[Exception]
+    says: tuple[str, ...]  # the argument, the value, what is allowed
+    state: Callable[[], Any]
+
+
+CASES: dict[str, Misuse] = {}
+
+
+def bad(
+    name: str,
+    call: Callable[..., Any],
+    error: type[Exception],
+    *says: str,
+    state: Callable[[], Any] = tuple,
+) -> None:
+    assert name not in CASES, name
+    CASES[name] = Misuse(call, error, says, state)
+
+
+def each(
+    owner: str,
+    call: Callable[..., Any],
+    argument: str,
+    values: tuple[Any, ...],
+    allowed: str,
+    error: type[Exception] = ValueError,
+    **options: Any,
+) -> None:
+    """One case per value of an argument."""
+    for wrong in values:
+        shown = repr(wrong) if isinstance(wrong, str) else str(wrong)
+        bad(
+            f"{owner}: {argument}={wrong!r}",
+            partial(call, **{argument: wrong}),
+            error,
+            argument,
+            shown,
+            allowed,
+            **options,
+        )
+
+
+def zeros(*shape: int) -> torch.Tensor:
+    return torch.zeros(shape)
+
+
+# What objects are made of.
+
+
+@cache
+def policy() -> GMMTanhPolicy:
+    torch.manual_seed(0)
+    return GMMTanhPolicy(MLP(3, 10, num_cells=[4]), SPEC, num_components=2)
+
+
+@cache  # a case draws no random numbers for it
+def critic(key: str, *, inputs: int = 5, positive: bool = False) -> ValueOperator:
+    last = [nn.Softplus()] if positive else []
+    keys = ["observation", "action"] if inputs == 5 else ["observation"]
+    return ValueOperator(MLP(inputs, 1, num_cells=[4]).extend(last), in_keys=keys, out_keys=[key])
+
+
+def make_tsallis(**options: Any) -> TsallisLoss:
+    return TsallisLoss(policy(), critic("state_action_value"), **options)
+
+
+def make_cvar(**options: Any) -> CVaRCostLoss:
+    networks = critic("cost_value"), critic("cost_std", positive=True)
+    return CVaRCostLoss(policy(), *networks, **{"cost_limit": 1.0, **options})
+
+
+def make_surrogate(**options: Any) -> CVaRSurrogateLoss:
+    networks = critic("cost_value", inputs=3), critic("cost_variance", inputs=3, positive=True)
+    return CVaRSurrogateLoss(*networks, **{"cost_limit": 1.0, **options})
+
+
+tsallis, cvar, surrogate = cache(make_tsallis), cache(make_cvar), cache(make_surrogate)
+
+
+@cache
+def return_surrogate() -> ReturnSurrogateLoss:
+    return ReturnSurrogateLoss(critic("state_value", inputs=3))
+
+
+for make in (policy, tsallis, cvar, surrogate, return_surrogate):
+    make()
+SoftUpdate(tsallis(), tau=0.5)  # without, TorchRL warns
+
+
+def data(*without: str) -> TensorDict:
+    """Trajectories [2, 4], without some entries."""
+    flags = {name: torch.zeros(2, 4, 1, dtype=torch.bool) for name in ("done", "terminated")}
+    rewards = {name: torch.ones(2, 4, 1) for name in ("reward", "cost")}
+    following = {"observation": zeros(2, 4, 3), **rewards, **flags}
+    td = TensorDict(
+        observation=zeros(2, 4, 3),
+        action=zeros(2, 4, 2),
+        action_log_prob=zeros(2, 4),
+        next=TensorDict(following, [2, 4]),
+        batch_size=[2, 4],
+    )
+    return td.exclude(*without)
+
+
+def weights(module: Callable[[], nn.Module]) -> Callable[[], Any]:
+    return lambda: module().state_dict()
+
+
+# The equations.
+
+q_values = (0, -1.0, NAN, INF, "two")
+each("q_logarithm", partial(F.q_logarithm, zeros(3)), "entropic_index", q_values, "positive finite")
+each(
+    "uniform_tsallis_entropy",
+    partial(F.uniform_tsallis_entropy, 1.0),
+    "entropic_index",
+    (0.0, -2.0),
+    "positive finite",
+)
+risk_levels = (0, -0.1, 1.5, NAN, "low")
+each("cvar_factor", F.cvar_factor, "risk_level", risk_levels, "in (0, 1]")
+each(
+    "gaussian_cvar",
+    partial(F.gaussian_cvar, zeros(3), zeros(3)),
+    "risk_level",
+    (0.0, 2.0),
+    "(0, 1]",
+)
+bad(
+    "gaussian_cvar: shapes",
+    lambda: F.gaussian_cvar(zeros(3), zeros(4), 0.5),
+    ValueError,
+    "std",
+    "(4,)",
+    "(3,)",
+)
+gammas = (1.0, -0.1, NAN, 2)
+each("discounted_cost_limit", partial(F.discounted_cost_limit, 0.1), "gamma", gammas, "in [0, 1)")
+each(
+    "discounted_cost_limit",
+    partial(F.discounted_cost_limit, gamma=0.9),
+    "cost_rate",
+    (-0.1, NAN),
+    "at least 0",
+)
+each(
+    "surrogate_change",
+    partial(F.surrogate_change, zeros(3), zeros(3), zeros(3), zeros(3)),
+    "gamma",
+    gammas,
+    "in [0, 1)",
+)
+bad(
+    "surrogate_change: shapes",
+    lambda: F.surrogate_change(zeros(3), zeros(3), zeros(3, 1), zeros(3), 0.9),
+    ValueError,
+    "log_mu",
+    "(3, 1)",
+    "same shape",
+)
+EYE = torch.eye(2)
+for name, moments in {
+    "old_cov": (zeros(2), torch.eye(3), zeros(2), EYE),
+    "new_mean": (zeros(2), EYE, zeros(3), EYE),
+    "new_cov": (zeros(2), EYE, zeros(2), zeros(2)),
+}.items():
+    bad(
+        f"moment_matched_kl: {name}",
+        partial(F.moment_matched_kl, *moments),
+        ValueError,
+        name,
+        str(tuple(moments[("old_mean", "old_cov", "new_mean", "new_cov").index(name)].shape)),
+        "must have shape (2",
+    )
+bad(
+    "lagrangian: shapes",
+    lambda: lagrangian(zeros(), zeros(2), zeros(3)),
+    ValueError,
+    "multiplier",
+    "(3,)",
+    "[m]",
+)
+
+# Multipliers.
+
+each("LagrangeMultiplier", LagrangeMultiplier, "num_constraints", (0, -1, 1.5), "at least 1")
+each("LagrangeMultiplier", LagrangeMultiplier, "init", (0.0, -1.0, NAN, INF), "positive and finite")
+multiplier = cache(LagrangeMultiplier)
+pid = cache(lambda: PIDMultiplier(2, kp=1.0, ki=0.1))
+for name, owner, call in (
+    ("LagrangeMultiplier.loss", multiplier, lambda c: multiplier().loss(c)),
+    ("PIDMultiplier.update", pid, lambda c: pid().update(c)),
+):
+    m = len(owner()())
+    bad(
+        f"{name}: shape",
+        partial(call, zeros(3)),
+        ValueError,
+        "constraint",
+        "(3,)",
+        f"must have shape ({m},)",
+        state=weights(owner),
+    )
+    bad(
+        f"{name}: NaN",
+        partial(call, torch.full((m,), NAN)),
+        ValueError,
+        "constraint",
+        "nan",
+        "must be finite",
+        state=weights(owner),
+    )
+make_pid = partial(PIDMultiplier, kp=1.0, ki=1.0)
+each("PIDMultiplier", make_pid, "num_constraints", (0, 1.5), "at least 1")
+for name in ("kp", "ki", "kd", "init"):
+    each("PIDMultiplier", make_pid, name, (-1.0, NAN, INF), "at least 0 and finite")
+bad(
+    "PIDMultiplier: gains", lambda: PIDMultiplier(kp=0.0, ki=0.0), ValueError, "ki", "0", "positive"
+)
+bad(
+    "PIDMultiplier: init without ki",
+    lambda: PIDMultiplier(kp=1.0, ki=0.0, init=2.0),
+    ValueError,
+    "init=2.0",
+    "ki=0.0",
+    "positive ki",
+)
+
+# Losses.
+
+each("TsallisLoss", make_tsallis, "entropic_index", q_values, "positive finite")
+each("TsallisLoss", make_tsallis, "num_qvalue_nets", (0, -2), "at least 1")
+each("TsallisLoss", make_tsallis, "alpha_init", (0.0, -1.0, NAN), "positive")
+each("CVaRCostLoss", make_cvar, "cost_limit", (-1.0, NAN, INF), "finite and at least 0")
+each("CVaRCostLoss", make_cvar, "risk_level", risk_levels, "in (0, 1]")
+each("CVaRCostLoss", make_cvar, "num_cost_nets", (0,), "at least 1")
+each(
+    "CVaRCostLoss", make_cvar, "variance_reward", ("none",), "one of ['second_moment', 'td_error']"
+)
+each("CVaRSurrogateLoss", make_surrogate, "cost_limit", (-1.0, NAN, INF), "finite and at least 0")
+each("CVaRSurrogateLoss", make_surrogate, "risk_level", risk_levels, "in (0, 1]")
+for owner, make in {
+    "TsallisLoss": make_tsallis,
+    "CVaRCostLoss": make_cvar,
+    "CVaRSurrogateLoss": make_surrogate,
+    "ReturnSurrogateLoss": partial(ReturnSurrogateLoss, critic("state_value", inputs=3)),
+}.items():
+    each(owner, make, "loss_function", ("l3",), "one of 'l1', 'l2', 'smooth_l1'")
+    each(owner, make, "reduction", ("median",), "one of 'none', 'mean', 'sum'")
+for owner, loss in {
+    "CVaRCostLoss": cvar,
+    "CVaRSurrogateLoss": surrogate,
+    "ReturnSurrogateLoss": return_surrogate,
+}.items():
+    name = f"{owner}.make_value_estimator"
+    make = loss().make_value_estimator
+    each(name, make, "gamma", gammas, "in [0, 1)", state=weights(loss))
+    each(name, make, "lmbda", (-0.1, 1.5), "in [0, 1]", state=weights(loss))
+bad(
+    "CVaRCostLoss.make_value_estimator: value_type",
+    lambda: cvar().make_value_estimator(ValueEstimators.GAE),
+    NotImplementedError,
+    "value_type",
+    "GAE",
+    "one of ['TD0', 'TDLambda']",
+    state=weights(cvar),
+)
+bad(
+    "ReturnSurrogateLoss.make_value_estimator: value_type",
+    lambda: return_surrogate().make_value_estimator(ValueEstimators.GAE),
+    NotImplementedError,
+    "value_type",
+    "GAE",
+    "RetraceEstimator or None",
+)
+bad(
+    "TsallisLoss.objective: log_prob",
+    lambda: tsallis().objective(data(), zeros(2, 4, 2), zeros(2, 4, 1)),
+    ValueError,
+    "log_prob",
+    "(2, 4, 1)",
+    "same shape",
+    state=weights(tsallis),
+)
+bad(
+    "CVaRCostLoss.constraint: level",
+    lambda: cvar().constraint(data(), zeros(2, 4, 2), level=torch.tensor(3.0)),
+    ValueError,
+    "level",
+    "3.",
+    "reference",
+)
+bad(
+    "ReturnSurrogateLoss.objective: no advantage",
+    lambda: return_surrogate().objective(data(), zeros(2, 4)),
+    KeyError,
+    "'advantage'",
+    "is missing",
+    "compute_advantage",
+)
+bad(
+    "CVaRSurrogateLoss.constraint: no advantage",
+    lambda: surrogate().constraint(data(), zeros(2, 4), surrogate().on_policy_moments(data())),
+    KeyError,
+    "'cost_advantage'",
+    "is missing",
+    "compute_advantage",
+)
+for owner, loss, key in (
+    ("TsallisLoss", tsallis, ("next", "observation")),
+    ("CVaRCostLoss", cvar, ("next", "observation")),
+    ("CVaRSurrogateLoss", surrogate, "observation"),
+):
+    bad(
+        f"{owner}: no {key}",
+        lambda loss=loss, key=key: loss()(data(key)),
+        KeyError,
+        '"observation"',
+        "not found",
+        "in TensorDict with keys",
+        state=weights(loss),
+    )
+
+# Retrace.
+
+make_retrace = partial(RetraceEstimator, gamma=0.9, lmbda=0.9)
+for name in ("gamma", "lmbda"):
+    each("RetraceEstimator", make_retrace, name, (-0.1, 1.5, NAN), "one number in [0, 1]")
+each("RetraceEstimator", make_retrace, "num_next_actions", (0,), "at least 1")
+each("RetraceEstimator", make_retrace, "action_space", ("binary",), "one-hot")
+bad(
+    "RetraceEstimator: no time",
+    lambda: make_retrace()(data()[0, 0]),
+    RuntimeError,
+    "tensordict",
+    "batch_size=()",
+    "trajectories",
+)
+entries = {"policy_log_prob": zeros(2, 4), "state_action_value": zeros(2, 4, 1)}
+following = {("next", "state_value"): zeros(2, 4, 1)}
+whole = data().update({**entries, **following})
+for key in (
+    "action_log_prob",
+    "policy_log_prob",
+    "state_action_value",
+    ("next", "state_value"),
+    ("next", "reward"),
+    ("next", "done"),
+):
+    lacking = whole.exclude(key)
+    bad(
+        f"RetraceEstimator: no {key}",
+        lambda td=lacking: make_retrace()(td),
+        KeyError,
+        str(key[-1] if isinstance(key, tuple) else key),
+        "the ",
+        "tensordict",
+        state=lambda td=lacking: td.to_dict(),
+    )
+bad(
+    "RetraceEstimator.for_loss: no critic",
+    lambda: RetraceEstimator.for_loss(surrogate(), gamma=0.9, lmbda=0.9),
+    ValueError,
+    "actor",
+    "CVaRSurrogateLoss",
+    "critic of states and actions",
+)
+column = zeros(4, 1)
+estimates = {
+    "retrace_lambda_return_estimate": (column, column),
+    "importance_sampling_lambda_return_estimate": (column, column),
+    "tree_backup_lambda_return_estimate": (column,),
+    "q_lambda_return_estimate": (),
+}
+for name, densities in estimates.items():
+    function, no = getattr(value, name), column.bool()
+
+    def estimate(
+        gamma=0.9,
+        lmbda=0.9,
+        action_value=column,
+        next_state_value=column,
+        done=no,
+        time_dim=-2,
+        function=function,
+        densities=densities,
+    ):
+        values = (action_value, next_state_value, column, done)
+        return function(gamma, lmbda, *densities, *values, time_dim=time_dim)
+
+    each(name, estimate, "gamma", (-0.1, 1.1, NAN), "in [0, 1]")
+    each(name, estimate, "lmbda", (2.0,), "in [0, 1]")
+    each(name, estimate, "time_dim", (-1, 5), "dimension of reward other than its last")
+    for argument in ("action_value", "next_state_value"):
+        bad(
+            f"{name}: {argument} of another shape",
+            partial(estimate, **{argument: zeros(5, 1)}),
+            ValueError,
+            argument,
+            "(5, 1)",
+            "must have shape (4, 1)",
+        )
+    bad(
+        f"{name}: done of floats",
+        partial(estimate, done=column),
+        TypeError,
+        "done",
+        "torch.float32",
+        "must be boolean",
+    )
+for function in (value.retrace_variance_reward, value.squared_td_error):
+    name = function.__name__
+    each(
+        name,
+        lambda gamma, function=function: function(gamma, column, column, column, column.bool()),
+        "gamma",
+        (-0.1, 1.1),
+        "in [0, 1]",
+    )
+    bad(
+        f"{name}: shape",
+        partial(function, 0.9, column, zeros(3, 1), column, column.bool()),
+        ValueError,
+        "action_value",
+        "(3, 1)",
+        "must have shape (4, 1)",
+    )
+    bad(
+        f"{name}: terminated",
+        partial(function, 0.9, column, column, column, column),
+        TypeError,
+        "terminated",
+        "torch.float32",
+        "must be boolean",
+    )
+bad(
+    "with_policy: no observation",
+    lambda: value.with_policy(data("observation"), policy()),
+    KeyError,
+    "observation",
+    "not found",
+    "action",
+    state=weights(policy),
+)
+
+# The policy.
+
+NETWORK = nn.Linear(3, 10)
+
+
+def make_policy(spec: Any = SPEC, **options: Any) -> GMMTanhPolicy:
+    return GMMTanhPolicy(NETWORK, spec, **{"num_components": 2, **options})
+
+
+each("GMMTanhPolicy", make_policy, "num_components", (0, -1, 1.5), "at least 1")
+each("GMMTanhPolicy", make_policy, "relaxation", ("soft",), "one of ('gumbel_softmax'")
+each("GMMTanhPolicy", make_policy, "temperature", (0.0, -1.0, NAN, INF), "positive and finite")
+each("GMMTanhPolicy", make_policy, "log_std_bounds", ((2.0, -4.0), (0.0, INF)), "increasing")
+bad(
+    "GMMTanhPolicy: unbounded",
+    lambda: make_policy(Unbounded((2,))),
+    TypeError,
+    "action_spec",
+    "Unbounded",
+    "Bounded spec of floating type",
+)
+bad(
+    "GMMTanhPolicy: infinite bounds",
+    lambda: make_policy(Bounded(-INF, 1.0, (2,))),
+    ValueError,
+    "action_spec",
+    "inf",
+    "finite bounds",
+)
+bad(
+    "GMMTanhPolicy: network",
+    lambda: make_policy(num_components=3)(data()),
+    ValueError,
+    "num_components",
+    "(2, 4, 10)",
+    "15",
+)
+make_extractor = partial(GMMParamExtractor, num_components=2, action_dim=2)
+each("GMMParamExtractor", make_extractor, "num_components", (0, 2.0), "at least 1")
+each("GMMParamExtractor", make_extractor, "action_dim", (0, 2.0), "at least 1")
+each("GMMParamExtractor", make_extractor, "log_std_bounds", ((1.0, 1.0),), "increasing")
+PARAMETERS = {"logits": zeros(5, 3), "loc": zeros(5, 3, 2), "scale": torch.ones(5, 3, 2)}
+for name, wrong in (("logits", zeros(5, 2)), ("loc", zeros(5, 3, 1)), ("scale", zeros(5, 3))):
+    for function in (TanhGaussianMixture, mixture_moments):
+        bad(
+            f"{function.__name__}: {name}",
+            partial(function, **{**PARAMETERS, name: wrong}),
+            ValueError,
+            name,
+            str(tuple(wrong.shape)),
+            "[*B, K, D]",
+        )
+make_mixture = partial(TanhGaussianMixture, **PARAMETERS)
+each("TanhGaussianMixture", make_mixture, "low", (2.0, -INF, NAN), "low must be")
+each("TanhGaussianMixture", make_mixture, "high", (INF, NAN), "must be finite")
+each("TanhGaussianMixture", make_mixture, "temperature", (0.0, NAN), "positive and finite")
+each("TanhGaussianMixture", make_mixture, "relaxation", ("none",), "one of ('gumbel_softmax'")
+bad(
+    "TanhGaussianMixture: low of another shape",
+    lambda: make_mixture(low=zeros(3)),
+    ValueError,
+    "low",
+    "(3,)",
+    "must broadcast to [*B, D] = (5, 2)",
+)
+bad(
+    "TanhGaussianMixture.log_prob: shape",
+    lambda: make_mixture().log_prob(zeros(5, 3)),
+    ValueError,
+    "value",
+    "(5, 3)",
+    "[..., 2]",
+)
+bad(
+    "TanhGaussianMixture.rsample: noise",
+    lambda: make_mixture().rsample(noise=zeros(5, 2)),
+    ValueError,
+    "noise",
+    "(5, 2)",
+    "must have shape [*S, 5, 5]",
+)
+bad(
+    "export_policy: path",
+    lambda: export_policy(policy(), "policy.pkl", data()[0]),
+    ValueError,
+    "path",
+    "'policy.pkl'",
+    ".pt2 or .onnx",
+)
+bad(
+    "export_policy: batch",
+    lambda: export_policy(policy(), "policy.pt2", data()),
+    ValueError,
+    "example",
+    "(2, 4)",
+    "batch size [B]",
+)
+bad(
+    "export_policy: keys",
+    lambda: export_policy(policy(), "policy.pt2", data("observation")[0]),
+    KeyError,
+    "example",
+    "'observation'",
+    "the policy's in_keys",
+)
+bad(
+    "DeterministicAction: inputs",
+    lambda: DeterministicAction(policy())(zeros(4, 3), zeros(4, 3)),
+    ValueError,
+    "inputs",
+    "2",
+    "['observation']",
+)
+
+# The trust region.
+
+
+@cache
+def parameter() -> nn.Parameter:
+    return nn.Parameter(torch.tensor([0.5, -0.5]))
+
+
+@cache
+def optimizer() -> TrustRegionSafeOptimizer:
+    return TrustRegionSafeOptimizer([parameter()], max_kl=0.1)
+
+
+OLD = torch.tensor([0.5, -0.5])
+
+
+def step(optim: Callable[[], TrustRegionSafeOptimizer] = optimizer, **entries: Any) -> Any:
+    """A step whose closure has entries changed, or left out if they are None."""
+
+    def closure() -> TensorDict:
+        x = parameter()
+        right = {
+            "objective": x.sum(),
+            "constraint": (x[0] - 1)[None],
+            "kl": 0.5 * (x - OLD).square().sum(),
+        }
+        changed = {**right, **entries}
+        return TensorDict({name: v for name, v in changed.items() if v is not None})
+
+    return optim().step(closure)
+
+
+def optimizer_state() -> Any:
+    return parameter().detach().clone(), copy.deepcopy(optimizer().state_dict())
+
+
+make_optimizer = partial(TrustRegionSafeOptimizer, [nn.Parameter(OLD.clone())])
+positive = (0.0, -1.0, NAN, INF, "small")
+each("TrustRegionSafeOptimizer", make_optimizer, "max_kl", positive, "positive finite number")
+each("TrustRegionSafeOptimizer", make_optimizer, "damping", (-1.0, NAN, INF), "at least 0")
+each("TrustRegionSafeOptimizer", make_optimizer, "cg_iters", (0, 1.5), "an integer, at least 1")
+each("TrustRegionSafeOptimizer", make_optimizer, "backtrack_ratio", (0.0, 1.0, NAN), "in (0, 1)")
+each("TrustRegionSafeOptimizer", make_optimizer, "max_backtracks", (-1, 0.5), "at least 0")
+each("TrustRegionSafeOptimizer", make_optimizer, "recovery_ratio", (0.0, 1.1, NAN), "in (0, 1]")
+each("TrustRegionSafeOptimizer", make_optimizer, "statistics_kl", (3,), "callable", TypeError)
+bad(
+    "TrustRegionSafeOptimizer: types of params",
+    lambda: TrustRegionSafeOptimizer([nn.Parameter(zeros(1)), nn.Parameter(zeros(1).double())]),
+    ValueError,
+    "params",
+    "torch.float64",
+    "one floating-point dtype",
+)
+bad(
+    "TrustRegionSafeOptimizer: groups",
+    lambda: optimizer().add_param_group({"params": [nn.Parameter(zeros(1))]}),
+    ValueError,
+    "params",
+    "several",
+    "one group",
+    state=optimizer_state,
+)
+for name, call, error, *says in (
+    ("no closure", lambda: optimizer().step(None), TypeError, "closure", "None", "TensorDict"),
+    (
+        "a number",
+        lambda: optimizer().step(lambda: 1.0),
+        TypeError,
+        "closure",
+        "float",
+        "must return a TensorDict",
+    ),
+    ("no objective", partial(step, objective=None), KeyError, "'objective'", "lacks", "'kl'"),
+    ("no kl", partial(step, kl=None), KeyError, "'kl'", "lacks", "'objective'"),
+    (
+        "objective of a batch",
+        partial(step, objective=zeros(3)),
+        ValueError,
+        "'objective'",
+        "(3,)",
+        "a scalar",
+    ),
+    ("kl of a batch", partial(step, kl=zeros(1)), ValueError, "'kl'", "(1,)", "a scalar"),
+    (
+        "a scalar constraint",
+        partial(step, constraint=zeros()),
+        ValueError,
+        "'constraint'",
+        "shape ()",
+        "shape [m]",
+    ),
+    (
+        "too many constraints",
+        partial(step, constraint=zeros(11)),
+        ValueError,
+        "'constraint'",
+        "(11,)",
+        "at most 10",
+    ),
+    (
+        "a constant objective",
+        partial(step, objective=zeros()),
+        ValueError,
+        "'objective'",
+        "does not",
+        "must depend on the optimizer's parameters",
+    ),
+    (
+        "a kl that is not zero",
+        partial(step, kl=torch.tensor(1.0)),
+        ValueError,
+        "'kl'",
+        "1.0",
+        "must be zero",
+    ),
+    (
+        "curvature statistics without statistics_kl",
+        partial(step, curvature_statistics=zeros(1)),
+        ValueError,
+        "'curvature_statistics'",
+        "None",
+        "statistics_kl",
+    ),
+):
+    bad(f"TrustRegionSafeOptimizer.step: {name}", call, error, *says, state=optimizer_state)
+
+# Environments.
+
+make_env = partial(envs.SafeGoalEnv, num_envs=3, num_threads=1)
+ROBOT = "one of 'car', 'doggo', 'doggo_torques', 'jackal', 'point'"
+
+
+@cache
+def env() -> envs.SafeGoalEnv:
+    env = make_env()
+    env.reset()
+    return env
+
+
+def snapshot() -> dict[str, torch.Tensor]:
+    return dict(env().state_dict())
+
+
+each("SafeGoalEnv", make_env, "robot", ("unicycle", 3), ROBOT)
+for name in ("num_envs", "num_threads", "episode_length"):
+    each("SafeGoalEnv", make_env, name, (0, -1, 2.5, True), "an integer >= 1")
+each("SafeGoalEnv", make_env, "seed", (-1, 1.5, "one"), "None or an integer >= 0")
+each("SafeGoalEnv", make_env, "task", ("goal", envs.GoalTask), "a task", TypeError)
+each("SafeGoalEnv", make_env, "randomization", ({"mass": (1, 2)},), "Randomization", TypeError)
+bad(
+    "SafeGoalEnv: a task for robots with a footprint",
+    lambda: make_env(task=envs.NavigationTask()),
+    ValueError,
+    "robot",
+    "'point'",
+    "footprint",
+)
+for name, action, *says in (
+    ("shape", zeros(3, 3), "action", "(3, 3)", "(3, 2)"),
+    ("NaN", torch.full((3, 2), NAN), "action", "environments [0, 1, 2]", "must be finite"),
+    ("infinity", torch.tensor([[0, 0], [INF, 0], [0, 0]]), "action", "[1]", "must be finite"),
+):
+    bad(
+        f"SafeGoalEnv.step: {name}",
+        lambda action=action: env()._step(TensorDict({"action": action})),
+        ValueError,
+        *says,
+        state=snapshot,
+    )
+bad(
+    "SafeGoalEnv.step: before a reset",
+    lambda: make_env()._step(TensorDict({"action": zeros(3, 2)})),
+    RuntimeError,
+    "reset",
+    "before",
+    "first step",
+)
+bad(
+    "SafeGoalEnv.reset: mask",
+    lambda: env()._reset(TensorDict({"_reset": torch.ones(4, dtype=torch.bool)})),
+    ValueError,
+    "_reset",
+    "(4,)",
+    "(3, 1)",
+    state=snapshot,
+)
+bad(
+    "SafeGoalEnv.set_seed: negative",
+    lambda: env()._set_seed(-1),
+    ValueError,
+    "seed",
+    "-1",
+    ">= 0",
+    state=snapshot,
+)
+for name in ("layout", "render"):
+    each(
+        f"SafeGoalEnv.{name}",
+        lambda index, name=name: getattr(env(), name)(index),
+        "index",
+        (-1, 3),
+        "in [0, 3)",
+        state=snapshot,
+    )
+bad(
+    "SafeGoalEnv.load_state_dict: entries",
+    lambda: env().load_state_dict({"physics": zeros(3)}),
+    ValueError,
+    "snapshot",
+    "['physics']",
+    "must have the entries",
+    state=snapshot,
+)
+bad(
+    "SafeGoalEnv.load_state_dict: shape",
+    lambda: env().load_state_dict({**env().state_dict(), "elapsed": zeros(4)}),
+    ValueError,
+    "'elapsed'",
+    "(4,)",
+    "(3,)",
+    state=snapshot,
+)
+bad("get_robot", lambda: envs.get_robot("tank"), ValueError, "robot", "'tank'", ROBOT)
+make_robot = lambda **options: type(envs.get_robot("point"))(  # noqa: E731
+    **{**vars(envs.get_robot("point")), **options}
+)
+for name in ("timestep", "keepout"):
+    each("Robot", make_robot, name, (0.0, -1.0, NAN), "positive and finite")
+for name in ("substeps", "action_dim"):
+    each("Robot", make_robot, name, (0, 1.5), "an integer >= 1")
+
+for task, counts in ((envs.GoalTask, "num_hazards"), (envs.NavigationTask, "num_boxes")):
+    owner = task.__name__
+    each(owner, task, counts, (-1,), "at least 0")
+    each(owner, task, counts, (1.5, True), "an int", TypeError)
+    each(owner, task, "binary_cost", (1,), "a bool", TypeError)
+    for name in ("goal_radius", "lidar_range", "cost_slope"):
+        each(owner, task, name, (0.0, -1.0, NAN, INF), "positive and finite")
+    each(owner, task, "lidar_bins", (0,), "at least")
+each("GoalTask", envs.GoalTask, "goal_keepout", (9.0,), "smaller than extent=1.5")
+each("GoalTask", envs.GoalTask, "hazard_keepout", (9.0,), "smaller than extent=1.5")
+each("NavigationTask", envs.NavigationTask, "discount", (1.0,), "in (0, 1)")
+each("NavigationTask", envs.NavigationTask, "wall_distance", (1.0,), "larger than grid_extent")
+bad(
+    "GoalTask: too many hazards",
+    lambda: make_env(task=envs.GoalTask(num_hazards=60)),
+    ValueError,
+    "num_hazards",
+    "60",
+    "fewer hazards",
+)
+for name in ("mass", "friction", "actuator_gain"):
+    each("Randomization", envs.Randomization, name, ((0.0, 1.0),), "must be positive")
+    each("Randomization", envs.Randomization, name, ((2.0, 1.0), 1.0, (1.0, INF)), "(low, high)")
+each("Randomization", envs.Randomization, "actuator_delay", ((0, 1.5),), "integers")
+each("Randomization", envs.Randomization, "actuator_delay", ((-1, 1),), ">= 0")
+each("Randomization", envs.Randomization, "sensor_noise", ((-0.1, 0.1),), ">= 0")
+each("Randomization", envs.Randomization, "lidar_dropout", ((0.5, 1.5),), "in [0, 1]")
+
+# Costs, checks, and the other faces.
+
+for name in ("num_steps", "time_limit"):
+    each(
+        "check_safe_env",
+        lambda **options: envs.check_safe_env(env(), **options),
+        name,
+        (0, -1),
+        "must be positive",
+        state=snapshot,
+    )
+bad(
+    "CostToReward: no such observation",
+    lambda: TransformedEnv(make_env(), envs.CostToReward("price")).full_reward_spec,
+    KeyError,
+    "observation",
+    "'price'",
+    "'violation'",
+)
+bad(
+    "CostToReward: shape",
+    lambda: TransformedEnv(make_env(), envs.CostToReward("observation")).full_reward_spec,
+    ValueError,
+    "'observation'",
+    "(3, 24)",
+    "(3, 1)",
+)
+bad(
+    "CostToReward: violation_key",
+    lambda: TransformedEnv(make_env(), envs.CostToReward("goal_met")).full_reward_spec,
+    ValueError,
+    "violation_key",
+    "'violation'",
+    "another",
+)
+bad(
+    "cost_from_info: another environment",
+    lambda: envs.cost_from_info(make_env()),
+    TypeError,
+    "env",
+    "SafeGoalEnv",
+    "GymWrapper or GymEnv",
+)
+bad(
+    "cost_from_info: frame_skip",
+    lambda: envs.cost_from_info(GymEnv("torchrl_safe/PointGoal-v0", frame_skip=2)),
+    ValueError,
+    "frame_skip",
+    "2",
+    "inside the Gymnasium environment",
+)
+
+
+def priced() -> Any:
+    env = envs.cost_from_info(GymEnv("torchrl_safe/PointGoal-v0"), cost="price")
+    return env.step(env.reset().set("action", zeros(2)))
+
+
+bad("cost_from_info: key", priced, KeyError, "info", "'price'", "'cost'")
+
+gym = cache(envs.GymGoalEnv)
+vector = cache(lambda: envs.GymGoalVectorEnv(num_envs=3, num_threads=1, autoreset_mode="Disabled"))
+many = partial(envs.GymGoalVectorEnv, num_envs=3, num_threads=1)
+for make, face, shape in ((gym, envs.GymGoalEnv, (2,)), (vector, many, (3, 2))):
+    owner = "GymGoalEnv" if make is gym else "GymGoalVectorEnv"
+    make().reset(seed=0)
+    state = lambda make=make: make()._core.snapshot()  # noqa: E731
+    each(owner, face, "robot", ("unicycle",), ROBOT)
+    each(owner, face, "episode_length", (0,), "an integer >= 1")
+    each(owner, face, "render_mode", ("ascii",), "None or one of ['rgb_array'")
+    for name, action, *says in (
+        ("shape", np.zeros(5), "(5,)", f"shape {shape}"),
+        ("kind", np.full(shape, "x"), "<U1", "must be numbers"),
+        ("NaN", np.full(shape, NAN), "environments [0", "must be finite"),
+    ):
+        bad(
+            f"{owner}.step: {name}",
+            lambda action=action, make=make: make().step(action),
+            ValueError,
+            "action",
+            *says,
+            state=state,
+        )
+    bad(
+        f"{owner}.reset: options",
+        lambda make=make: make().reset(options={"speed": 1}),
+        ValueError,
+        "options",
+        "'speed'",
+        "unknown",
+        state=state,
+    )
+    bad(
+        f"{owner}.reset: seed",
+        lambda make=make: make().reset(seed=-1),
+        ValueError,
+        "seed",
+        "-1",
+        ">= 0",
+        state=state,
+    )
+each("GymGoalVectorEnv", many, "autoreset_mode", ("Never",), "'NextStep'")
+each("GymGoalVectorEnv", many, "num_envs", (0,), "an integer >= 1")
+bad(
+    "GymGoalVectorEnv.reset: seeds",
+    lambda: vector().reset(seed=[1, 2, 3]),
+    TypeError,
+    "seed",
+    "[1, 2, 3]",
+    "one integer or None",
+    state=lambda: vector()._core.snapshot(),
+)
+bad(
+    "GymGoalVectorEnv.reset: mask",
+    lambda: vector().reset(options={"reset_mask": np.zeros(2)}),
+    ValueError,
+    "reset_mask",
+    "float64 (2,)",
+    "bool array of shape (3,)",
+    state=lambda: vector()._core.snapshot(),
+)
+bad(
+    "gymnasium.make",
+    lambda: gymnasium.make("torchrl_safe/TankGoal-v0"),
+    gymnasium.error.NameNotFound,
+    "Environment",
+    "Tank",
+    "oesn't exist",
+)
+control = cache(lambda: suite.load(random=0))
+control().reset()
+control_state = lambda: control().task._core.snapshot()  # noqa: E731
+each("suite.load", suite.load, "robot", ("unicycle",), ROBOT)
+each("suite.load", suite.load, "task", ("push",), "'goal' or a Task")
+each("suite.load", suite.load, "episode_length", (0,), "an integer >= 1")
+each("suite.load", suite.load, "random", (-1,), ">= 0")
+bad(
+    "suite.Physics.set_control: shape",
+    lambda: control().physics.set_control(np.zeros(3)),
+    ValueError,
+    "action",
+    "(3,)",
+    "(2,)",
+    state=control_state,
+)
+bad(
+    "suite.Physics.step: nstep",
+    lambda: control().physics.step(3),
+    ValueError,
+    "nstep",
+    "3",
+    "must be 10",
+    state=control_state,
+)
+bad(
+    "suite.SafeTask: NaN",
+    lambda: control().step(np.full(2, NAN)),
+    ValueError,
+    "action",
+    "[0]",
+    "must be finite",
+    state=control_state,
+)
+
+# Records.
+
+
+def act(td: Any) -> Any:
+    return env().rand_action(td)
+
+
+evaluate = partial(record.evaluate, env(), act, exploration_type=ExplorationType.RANDOM)
+each("evaluate", evaluate, "num_steps", (0, -1), "at least 1", state=snapshot)
+bad(
+    "summarize: no episode",
+    lambda: record.summarize(TensorDict({"score": zeros(0)}, [0])),
+    ValueError,
+    "episodes",
+    "[0]",
+    "at least one",
+)
+bad(
+    "score: shapes",
+    lambda: record.score(zeros(3), zeros(4)),
+    ValueError,
+    "violations",
+    "(4,)",
+    "same shape",
+)
+bad(
+    "bootstrap_interval: shape",
+    lambda: record.bootstrap_interval(zeros(3, 2)),
+    ValueError,
+    "values",
+    "(3, 2)",
+    "[N]",
+)
+bad(
+    "proportion_interval: trials",
+    lambda: record.proportion_interval(0, 0),
+    ValueError,
+    "trials",
+    "0",
+    "at least 1",
+)
+bad(
+    "proportion_interval: successes",
+    lambda: record.proportion_interval(5, 4),
+    ValueError,
+    "successes",
+    "5",
+    "in [0, 4]",
+)
+for function, key in (
+    (record.batch_metrics, "cost"),
+    (record.batch_metrics, "violation"),
+    (record.count_violations, "violation"),
+):
+    steps = data().set(("next", "violation"), torch.zeros(2, 4, 1, dtype=torch.bool))
+    bad(
+        f"{function.__name__}: no {key}",
+        partial(function, steps.exclude(("next", key))),
+        KeyError,
+        key,
+        "is missing",
+        "reward",
+    )
+    bad(
+        f"{function.__name__}: {key} of another shape",
+        partial(function, steps.clone().set(("next", key), zeros(2, 4, 2))),
+        ValueError,
+        key,
+        "(2, 4, 2)",
+        "(2, 4, 1)",
+    )
+bad(
+    "batch_metrics: empty",
+    lambda: record.batch_metrics(data()[:0]),
+    ValueError,
+    "td",
+    "(0, 4)",
+    "at least one step",
+)
+each(
+    "discounted_sums",
+    partial(record.discounted_sums, zeros(3)),
+    "gamma",
+    (-0.1, 1.1, NAN),
+    "in [0, 1]",
+)
+episode = torch.ones(4, 200)
+calibrate = lambda **options: record.calibrate(  # noqa: E731
+    episode, episode, episode, **{"gamma": 0.9, "risk_level": 0.5, **options}
+)
+each("calibrate", calibrate, "gamma", gammas, "in [0, 1)")
+each("calibrate", calibrate, "risk_level", (0.0, 1.5, NAN), "in (0, 1]")
+each("calibrate", calibrate, "num_bins", (0,), "at least 1")
+each("calibrate", calibrate, "tail", (0.0, 1.0, NAN), "in (0, 1)")
+bad(
+    "calibrate: short episodes",
+    lambda: calibrate(gamma=0.9999),
+    ValueError,
+    "gamma",
+    "0.9999",
+    "longer episodes",
+)
+bad(
+    "calibrate: shapes",
+    lambda: record.calibrate(episode, zeros(4, 3), episode, gamma=0.9, risk_level=0.5),
+    ValueError,
+    "cvar",
+    "(4, 3)",
+    "one shape [N, T]",
+)
+for function in (record.read_metrics, partial(record.plot_learning_curves, path="curves.png")):
+    bad(
+        getattr(function, "__name__", "plot_learning_curves"),
+        partial(function, "nowhere"),
+        FileNotFoundError,
+        "run_dir",
+        "'nowhere'",
+        "a directory",
+    )
+record_paths = partial(record.record_trajectories, env(), act, num_episodes=2)
+each("record_trajectories", record_paths, "num_steps", (0,), "at least 1", state=snapshot)
+each("record_trajectories", record_paths, "num_episodes", (0, 4), "in [1, 3]", state=snapshot)
+bad(
+    "plot_trajectories: none",
+    lambda: record.plot_trajectories([], "paths.png"),
+    ValueError,
+    "trajectories",
+    "none",
+    "at least one",
+)
+film = partial(record.record_video, env(), act, path="film.mp4")
+each("record_video", film, "path", ("film.gif",), "must end in .mp4", state=snapshot)
+for name in ("num_steps", "every", "fps"):
+    each("record_video", film, name, (0, -1), "must be positive", state=snapshot)
+for name in ("width", "height"):
+    each("record_video", film, name, (0, 31), "even number", state=snapshot)
+each("record_video", film, "index", (3, -1), "in [0, 3)", state=snapshot)
+
+
+def same(one: Any, other: Any) -> bool:
+    pairs = zip(tree_leaves(one), tree_leaves(other), strict=True)
+    return all(np.array_equal(x, y, equal_nan=is_float(x)) for x, y in pairs)
+
+
+def is_float(leaf: Any) -> bool:
+    return np.asarray(leaf).dtype.kind == "f"
+
+
+def kept(state: Any) -> Any:
+    """A copy that what comes later cannot reach."""
+    return copy.deepcopy(tree_leaves(state))
+
+
+def test_there_are_enough():
+    assert len(CASES) > 300
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_api(name, monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    case = CASES[name]
+    before = kept(case.state())
+    random = torch.get_rng_state()
+    with pytest.raises(case.error) as info:
+        case.call()
+    message = str(info.value.args[0])
+    for part in case.says:
+        assert part in message, f"{part!r} is not in: {message}"
+    assert same(before, case.state())
+    assert torch.equal(torch.get_rng_state(), random)
+    assert not list(tmp_path.iterdir())
+
+
+# Configurations.
+
+EXAMPLES = Path(config.__file__).parent
+CONFIGS = sorted(path.stem for path in EXAMPLES.glob("*.yaml"))
+
+# One impossible value for each option of each example, and what its message says is allowed.
+IMPOSSIBLE = {
+    "seed": (-1, "at least 0"),
+    "num_threads": (0, "at least 1"),
+    "run_dir": ("", "a path"),
+    "resume": (1, "one of True, False"),
+    "update": ("newton", "'trust_region', 'lagrangian', 'pid'"),
+    "env.name": ("", "a name"),
+    "env.robot": ("unicycle", "'point'"),
+    "env.num_envs": (0, "at least 1"),
+    "env.episode_length": (0, "at least 1"),
+    "task.top_speed": (0.0, "(0, inf)"),
+    "task.tilt_cost": (-1.0, "[0, inf)"),
+    "gait": ([{"population": 3}], "a list of stages"),
+    "collector.backend": ("threads", "'single', 'multi_sync', 'multi_async', 'ray'"),
+    "collector.num_workers": (0, "at least 1"),
+    "collector.frames_per_batch": (0, "at least 1"),
+    "collector.total_frames": (0, "at least 1"),
+    "collector.init_frames": (-1, "at least 0"),
+    "replay_buffer.storage": ("tape", "'memory', 'memmap'"),
+    "replay_buffer.size": (0, "at least 1"),
+    "replay_buffer.slice_len": (0, "at least 1"),
+    "replay_buffer.batch_size": (0, "at least 1"),
+    "estimator.name": ("td1", "'retrace', 'td0'"),
+    "estimator.gamma": (1.0, "[0, 1)"),
+    "estimator.lmbda": (1.5, "[0, 1]"),
+    "network.num_cells": ([0], "integers of at least 1"),
+    "policy.num_cells": ([64, -1], "integers of at least 1"),
+    "policy.num_components": (0, "at least 1"),
+    "policy.relaxation": ("soft", "'gumbel_softmax'"),
+    "policy.temperature": (0.0, "(0, inf)"),
+    "policy.log_std_bounds": ([2.0, -4.0], "the smaller one first"),
+    "policy.init_std": (0.0, "(0, inf)"),
+    "critic.num_cells": ([1.5], "integers of at least 1"),
+    "loss.entropic_index": (0.0, "(0, inf)"),
+    "loss.alpha": (0.0, "(0, inf)"),
+    "loss.alpha_init": (-1.0, "(0, inf)"),
+    "loss.target_update_tau": (0.0, "(0, 1]"),
+    "loss.gamma": (1.0, "[0, 1)"),
+    "loss.cost_gamma": (-0.1, "[0, 1)"),
+    "loss.lmbda": (1.1, "[0, 1]"),
+    "loss.risk_level": (0.0, "(0, 1]"),
+    "loss.cost_limit": (-1.0, "[0, inf)"),
+    "loss.initial_cost_limit": (math.inf, "[0, inf)"),
+    "loss.anneal_frames": (-1, "at least 0"),
+    "loss.variance_reward": ("none", "'td_error', 'second_moment'"),
+    "loss.clip_epsilon": (0.0, "(0, 1)"),
+    "loss.entropy_coeff": (-1.0, "[0, inf)"),
+    "lagrangian.policy_lr": (0.0, "(0, inf)"),
+    "lagrangian.minibatch_size": (0, "at least 1"),
+    "lagrangian.init": (0.0, "(0, inf)"),
+    "lagrangian.lr": (-0.1, "(0, inf)"),
+    "pid.kp": (-1.0, "[0, inf)"),
+    "pid.ki": (0.0, "(0, inf)"),
+    "pid.kd": (-1.0, "[0, inf)"),
+    "optim.num_epochs": (0, "at least 1"),
+    "optim.num_updates": (0, "at least 1"),
+    "optim.tau": (1.5, "(0, 1]"),
+    "optim.lr": (0.0, "(0, inf)"),
+    "optim.updates_per_frame": (0.0, "(0, inf)"),
+    "optim.critic_lr": (0.0, "(0, inf)"),
+    "optim.max_grad_norm": (0.0, "(0, inf)"),
+    "optim.max_skipped": (-1, "at least 0"),
+    "optim.critic_rounds": (0, "at least 1"),
+    "optim.critic_frames": (0, "at least 1"),
+    "optim.minibatch_size": (0, "at least 1"),
+    "optim.policy_frames": (0, "at least 1"),
+    "optim.curvature_frames": (0, "null or an integer of at least 1"),
+    "optim.max_kl": (0.0, "(0, inf)"),
+    "optim.damping": (-0.1, "[0, inf)"),
+    "optim.cg_iters": (0, "at least 1"),
+    "optim.backtrack_ratio": (1.0, "(0, 1)"),
+    "optim.max_backtracks": (-1, "at least 0"),
+    "optim.recovery_ratio": (0.0, "(0, 1]"),
+    "logger.backend": ("paper", "'csv', 'tensorboard', 'wandb'"),
+    "logger.project_name": ("", "a name"),
+    "eval.interval": (0, "at least 1"),
+    "eval.num_episodes": (0, "at least 1"),
+    "eval.final_episodes": (0, "at least 1"),
+    "eval.num_directions": (0, "at least 1"),
+    "eval.num_steps": (0, "at least 1"),
+    "checkpoint.interval": (0, "at least 1"),
+    "checkpoint.keep_last": (0, "at least 1"),
+    "video.num_steps": (-1, "at least 0"),
+}
+
+
+@cache
+def resolved(name: str) -> dict[str, Any]:
+    with hydra.initialize_config_dir(str(EXAMPLES), version_base="1.3"):
+        return OmegaConf.to_container(hydra.compose(name), resolve=True)
+
+
+def options(node: dict[str, Any], prefix: str = "") -> Iterator[str]:
+    for name, setting in node.items():
+        if isinstance(setting, dict):
+            yield from options(setting, f"{prefix}{name}.")
+        else:
+            yield prefix + name
+
+
+def refused(name: str, option: str, wrong: Any) -> str:
+    """The message that a configuration gets for one wrong option; it is left as it is."""
+    settings = copy.deepcopy(resolved(name))
+    *sections, last = option.split(".")
+    reduce(dict.__getitem__, sections, settings)[last] = wrong
+    cfg = OmegaConf.create(settings)
+    with pytest.raises(ValueError) as info:
+        config.check_config(cfg)
+    assert repr(OmegaConf.to_container(cfg)) == repr(settings)
+    return str(info.value)
+
+
+@pytest.mark.parametrize("name", CONFIGS)
+def test_configurations(name):
+    """Each option of a file: an impossible value, another type, and another name."""
+    config.check_config(OmegaConf.create(resolved(name)))
+    own = OmegaConf.to_container(OmegaConf.load(EXAMPLES / f"{name}.yaml"))
+    for option in options({key: own[key] for key in own.keys() - {"defaults", "hydra"}}):
+        wrong, allowed = IMPOSSIBLE[option]
+        message = refused(name, option, wrong)
+        assert message.startswith(f"{option} must be "), message
+        assert allowed in message, message
+        assert message.endswith(f"got {wrong!r}."), message
+        kind = "?" if not isinstance(wrong, str) else 7
+        message = refused(name, option, kind)
+        assert message.startswith(f"{option} must be "), message
+        assert message.endswith(f"got {kind!r}."), message
+        if isinstance(wrong, float):
+            assert "got nan" in refused(name, option, math.nan)
+        unknown = f"{option}_"
+        message = refused(name, unknown, 1)
+        assert message.startswith(f"{unknown} is not an option"), message
+        assert option in message, message

@@ -1,6 +1,6 @@
 """A cost constraint added to compose_trpo.py: swing up, but with few steps above 4 rad/s.
 
-    python examples/compose_constraint.py               # at most 10 % of the steps; 3 minutes
+    python examples/compose_constraint.py               # at most 10 % of the steps; 2 minutes
     python examples/compose_constraint.py --limit 0.05  # csv curves in runs/compose_constraint
 
 What it took: a cost, its critics, and one more entry in the optimizer's closure.
@@ -94,7 +94,7 @@ if __name__ == "__main__":
     env = TransformedEnv(make_env(seed=0), SpeedCost())
     policy = GMMTanhPolicy(MLP(3, 3, num_cells=[64, 64]), env.action_spec, num_components=1)
     stepper = ConstrainedStepper(policy, parser.parse_args().limit)
-    trainer = make_trainer(env, stepper, 160_000, "runs/compose_constraint")
+    trainer = make_trainer(env, stepper, 112_000, "runs/compose_constraint")
     cost = LogScalar(("next", "cost"), "train/cost", log_pbar=True, include_std=False)
     cost.register(trainer, "log_cost")
     trainer.train()

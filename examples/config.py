@@ -111,6 +111,8 @@ BOOLEAN = Rule(lambda v: isinstance(v, bool), "one of True, False")  # 1 == True
 PATH = Rule(lambda v: isinstance(v, str) and v != "", "a path")
 NAME = Rule(lambda v: isinstance(v, str) and v != "", "a name")
 
+EXTRAS = ("tensorboard", "wandb", "ray")  # packages that bear the name of the extra
+
 RULES: dict[str, Rule] = {
     "seed": integer(0),
     "num_threads": integer(1),
@@ -203,7 +205,7 @@ def check_config(cfg: DictConfig) -> None:
 
     Raises:
         ValueError: if an option is unknown, its value is impossible, or two do not go together.
-        ModuleNotFoundError: if the logger's package is not installed.
+        ModuleNotFoundError: if the package of a logger or collector is not installed.
     """
     options = dict(_flat(OmegaConf.to_container(cfg, resolve=True)))
     for name, value in options.items():
@@ -214,12 +216,13 @@ def check_config(cfg: DictConfig) -> None:
         if not rule.holds(value):
             raise ValueError(f"{name} must be {rule.text}, got {value!r}.")
     _check_together(options)
-    backend = options.get("logger.backend")
-    if backend in ("tensorboard", "wandb") and find_spec(backend) is None:
-        raise ModuleNotFoundError(
-            f"logger.backend={backend} needs a package: pip install 'torchrl-safe[{backend}]'; "
-            "logger.backend=csv needs none."
-        )
+    for name, plain in (("logger.backend", "csv"), ("collector.backend", "single")):
+        extra = options.get(name)
+        if extra in EXTRAS and find_spec(extra) is None:
+            raise ModuleNotFoundError(
+                f"{name}={extra} needs a package: pip install 'torchrl-safe[{extra}]'; "
+                f"{name}={plain} needs none."
+            )
 
 
 def _check_together(options: Mapping[str, Any]) -> None:

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
@@ -24,7 +25,13 @@ Controller = Callable[[NDArray[np.float32]], NDArray[np.float32]]
 
 def load(path: Path) -> Controller:
     """The file as a function of arrays."""
+    if not path.is_file():
+        raise FileNotFoundError(f"{path} is no file: export.py writes one from a run.")
     if path.suffix == ".onnx":
+        if find_spec("onnxruntime") is None:
+            raise ModuleNotFoundError(
+                f"{path} needs a runtime: pip install 'torchrl-safe[export]', or onnxruntime alone."
+            )
         import onnxruntime
 
         session = onnxruntime.InferenceSession(path)

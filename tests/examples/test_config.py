@@ -89,10 +89,13 @@ def test_memmap_is_for_the_cpu(monkeypatch):
         config.check_config(compose("safetac_point", "device=cuda", "replay_buffer.storage=memmap"))
 
 
-@pytest.mark.parametrize("backend", ["wandb", "tensorboard"])
-def test_missing_extra(monkeypatch, backend):
+@pytest.mark.parametrize(
+    ("option", "backend"),
+    [("logger", "wandb"), ("logger", "tensorboard"), ("collector", "ray")],
+)
+def test_missing_extra(monkeypatch, option, backend):
     monkeypatch.setattr(
         config, "find_spec", lambda name: None if name == backend else util.find_spec(name)
     )
     with pytest.raises(ModuleNotFoundError, match=rf"pip install 'torchrl-safe\[{backend}\]'"):
-        config.check_config(compose("safetac_point", f"logger.backend={backend}"))
+        config.check_config(compose("safetac_point", f"{option}.backend={backend}"))

@@ -103,6 +103,16 @@ def test_watch_without_a_log(tmp_path):
         watch.main(tmp_path, every=1.0, once=True)
 
 
+def test_drive_from_what_is_not_there(tmp_path, monkeypatch):
+    with pytest.raises(FileNotFoundError, match=r"policy.pt2 is no file: export.py writes one"):
+        run_exported.load(tmp_path / "policy.pt2")
+    path = tmp_path / "policy.onnx"
+    path.touch()
+    monkeypatch.setattr(run_exported, "find_spec", lambda name: None)
+    with pytest.raises(ModuleNotFoundError, match=r"pip install 'torchrl-safe\[export\]'"):
+        run_exported.load(path)
+
+
 @pytest.mark.parametrize("onnx", [False, True])
 def test_export_and_drive(run_dir, onnx, capsys):
     path = export.main(run_dir, onnx=onnx)

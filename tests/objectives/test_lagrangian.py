@@ -104,7 +104,10 @@ class TestPIDMultiplier:
             ({"kp": 0.0, "ki": 0.0}, "must be positive"),
             ({"kp": 1.0, "ki": 0.0, "init": 1.0}, "needs a positive ki"),
             ({"kp": 1.0, "ki": float("nan")}, "ki must be at least 0"),
-            ({"num_constraints": 0, "kp": 1.0, "ki": 0.1}, "num_constraints must be at least 1"),
+            (
+                {"num_constraints": 0, "kp": 1.0, "ki": 0.1},
+                "num_constraints, an integer, must be at least 1, got 0",
+            ),
         ],
     )
     def test_bad_arguments(self, arguments, message):

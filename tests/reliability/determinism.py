@@ -18,6 +18,7 @@ TESTS = Path(__file__).parents[1]
 sys.path[:0] = [str(TESTS.parent / "examples"), str(TESTS / "examples"), str(TESTS / "reliability")]
 
 import compose_constraint  # noqa: E402
+import compose_retrace  # noqa: E402
 import compose_trpo  # noqa: E402
 import compose_tsallis  # noqa: E402
 import hydra  # noqa: E402
@@ -65,6 +66,12 @@ def run_compose_tsallis(folder: Path) -> None:
     (folder / "episodes.json").write_text(json.dumps(episodes))
 
 
+def run_compose_retrace(folder: Path) -> None:
+    episodes = compose_retrace.train(lmbda=0.9, seed=0, total_frames=1_100)
+    folder.mkdir()
+    (folder / "episodes.json").write_text(json.dumps(episodes))
+
+
 def run_compose_trpo(folder: Path, limit: float | None = None) -> None:
     torch.manual_seed(0)
     env = compose_trpo.make_env(seed=0)
@@ -88,6 +95,7 @@ CASES: dict[str, Callable[[Path], None]] = {
     "doggo_controller": doggo.launch,
     "retrace_sac": run_retrace_sac,
     "compose_tsallis": run_compose_tsallis,
+    "compose_retrace": run_compose_retrace,
     "compose_trpo": run_compose_trpo,
     "compose_constraint": partial(run_compose_trpo, limit=0.05),
     # Not one more example: what shows that a number can differ at all.

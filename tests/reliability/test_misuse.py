@@ -1286,6 +1286,7 @@ IMPOSSIBLE = {
     "optim.critic_lr": (0.0, "(0, inf)"),
     "optim.max_grad_norm": (0.0, "(0, inf)"),
     "optim.max_skipped": (-1, "at least 0"),
+    "device": ("abacus", "cpu"),
     "optim.critic_rounds": (0, "at least 1"),
     "optim.critic_frames": (0, "at least 1"),
     "optim.minibatch_size": (0, "at least 1"),

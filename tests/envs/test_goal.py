@@ -465,6 +465,10 @@ def test_a_diverging_simulation_is_truncated_and_counted(tmp_path, monkeypatch):
     expected = reference.step(td.clone())["next"]
     following = env.step(td.clone())["next"]
     assert env.instabilities == 1
+    state = env.state_dict()
+    env.step(td.clone())
+    env.load_state_dict(state)
+    assert env.state_dict()["frame_diverged"].tolist() == [False, True, False]
     for key in ("diverged", "truncated"):
         assert following[key].flatten().tolist() == [False, True, False]
     assert not following["terminated"].any()

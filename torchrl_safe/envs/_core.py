@@ -172,6 +172,7 @@ class Frame(NamedTuple):
     violation: Mask
     violations: NDArray[np.int64]
     goal_met: Mask
+    diverged: Mask
     terminated: Mask
     truncated: Mask
 
@@ -181,7 +182,7 @@ class Core:
 
     A simulation that diverges is put back where it was, and its episode is truncated: it repeats
     its last observation and cost without a reward, and nothing non-finite reaches a learner.
-    ``diverged`` [N] says which did in the last step, ``instabilities`` counts them.
+    The frame's ``diverged`` says which did in the last step, ``instabilities`` counts them.
 
     Built by :func:`make_core`.
     """
@@ -213,7 +214,6 @@ class Core:
         self.episode_length = episode_length
         self.stagger = stagger
         self.instabilities = 0
-        self.diverged = np.zeros(num_envs, bool)
         self.action_dim = robot.action_dim
         self.observation_size = task.observation_size(robot)
         self.randomization = randomization
@@ -227,7 +227,7 @@ class Core:
         self._rows: Rows = np.arange(num_envs)
         zero, no = np.zeros(num_envs), np.zeros(num_envs, bool)
         blank = np.zeros((num_envs, self.observation_size), np.float32)
-        self._frame = Frame(blank, zero, zero, no, no.astype(np.int64), no, no, no)
+        self._frame = Frame(blank, zero, zero, no, no.astype(np.int64), no, no, no, no)
         self.seed(seed)
 
     def seed(self, seed: int | None) -> None:
@@ -265,7 +265,6 @@ class Core:
         }
         staggered = self.stagger and mask is None
         self._elapsed[rows] = rows * self.episode_length // self.num_envs if staggered else 0
-        self.diverged = _with_rows(self.diverged, rows, np.zeros(1, bool))
         self._started = True
         motion = Motion(*(part[rows] for part in self._robots.motion))
         sensed = self.task.sense(self.robot, motion, objects)
@@ -277,6 +276,7 @@ class Core:
             violation=sensed.violation,
             violations=sensed.violation.astype(np.int64),
             goal_met=no,
+            diverged=no,
             terminated=no,
             truncated=no,
         )
@@ -311,8 +311,8 @@ class Core:
             raise ValueError(f"action must be finite; it is not in environments {bad.tolist()}.")
         # In float64, whatever the face: a command computed in float32 would be another one.
         command = np.minimum(np.maximum(action, -1.0, dtype=np.float64), 1.0)
-        self.diverged = self._robots.step(command)
-        self.instabilities += int(self.diverged.sum())
+        diverged = self._robots.step(command)
+        self.instabilities += int(diverged.sum())
         self._elapsed += 1
         remaining = np.maximum(self.episode_length - self._elapsed, 0)
         robot, motion = self.robot, self._robots.motion
@@ -326,8 +326,9 @@ class Core:
             outcome.violations > 0,
             outcome.violations,
             outcome.goal_met,
+            diverged,
             outcome.terminated,
-            truncated=(remaining == 0) | self.diverged,
+            truncated=(remaining == 0) | diverged,
         )
         return self._frame
 

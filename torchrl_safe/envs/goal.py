@@ -163,7 +163,7 @@ class SafeGoalEnv(EnvBase):
             "violation": _column(frame.violation),
             "violations": _column(frame.violations),
             "goal_met": _column(frame.goal_met),
-            "diverged": _column(self._core.diverged),
+            "diverged": _column(frame.diverged),
             "done": _column(frame.terminated | frame.truncated),
             "terminated": _column(frame.terminated),
             "truncated": _column(frame.truncated),

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.special import expit
 
 from torchrl_safe.envs._random import RandomStreams
-from torchrl_safe.envs.robots import Array, Motion, Robot
+from torchrl_safe.envs.robots import Array, Motion, Robot, to_robot_frame
 from torchrl_safe.envs.tasks.base import (
     Objects,
     Outcome,
@@ -267,9 +267,8 @@ def lidar(task: GoalTask, offset: Array, distance: Array, heading: Array) -> Arr
         array: [N, B] in [0, 1].
     """
     bins, num_envs = task.lidar_bins, len(offset)
-    x, y = offset[..., 0], offset[..., 1]
-    cos, sin = heading[:, :1], heading[:, 1:]
-    turn = np.arctan2(cos * y - sin * x, cos * x + sin * y)
+    ahead = to_robot_frame(offset, heading[:, None])
+    turn = np.arctan2(ahead[..., 1], ahead[..., 0])
     turn *= bins / (2.0 * np.pi)
     turn += bins * (turn < 0.0)
     centre = turn.astype(np.intp)

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
-import hydra
 import pytest
 import torch
 import torch.nn.functional as F
+from bench_training import compose
 from critics import make_critic_optim, make_losses, minibatches
 from descent import Descent
 from omegaconf import DictConfig
@@ -19,8 +18,6 @@ from torch import nn
 from utils import make_policy
 
 from torchrl_safe.envs import SafeGoalEnv
-
-EXAMPLES = Path(__file__).resolve().parents[1] / "examples"
 
 
 def make_data(num_frames: int, observation_dim: int, action_dim: int) -> TensorDict:
@@ -97,8 +94,7 @@ def plain(cfg: DictConfig, env: SafeGoalEnv, data: TensorDict) -> Callable[[], N
 def bench_round(benchmark: Any, width: int, how: str) -> None:
     """One round, from targets to the last gradient step."""
     torch.manual_seed(0)
-    with hydra.initialize_config_dir(str(EXAMPLES), version_base="1.3"):
-        cfg = hydra.compose("safetac_point", [f"critic.num_cells=[{width},{width}]"])
+    cfg = compose([f"critic.num_cells=[{width},{width}]"])
     env = SafeGoalEnv(num_envs=1, num_threads=1)
     data = make_data(cfg.optim.critic_frames, 24, env.action_spec.shape[-1])
     benchmark.group = (

@@ -31,6 +31,12 @@ SILENT = [
 OMNISAFE_CPO = 129
 
 
+def compose(overrides: list[str]) -> DictConfig:
+    """The example's configuration."""
+    with hydra.initialize_config_dir(str(EXAMPLE.parent), version_base="1.3"):
+        return hydra.compose(EXAMPLE.stem, overrides)
+
+
 def warm_up_updates(cfg: DictConfig) -> int:
     """Updates up to the first one that learns, which warms up."""
     return max(1, -(-cfg.collector.init_frames // cfg.collector.frames_per_batch))
@@ -38,8 +44,7 @@ def warm_up_updates(cfg: DictConfig) -> int:
 
 def main(overrides: list[str]) -> None:
     """Train for a few updates and print the table."""
-    with hydra.initialize_config_dir(str(EXAMPLE.parent), version_base="1.3"):
-        cfg = hydra.compose(EXAMPLE.stem, overrides)
+    cfg = compose(overrides)
     per_batch = cfg.collector.frames_per_batch
     updates = warm_up_updates(cfg) + NUM_UPDATES
     with tempfile.TemporaryDirectory() as run_dir:

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
-import hydra
 import pytest
 import torch
+from bench_training import compose
 from critics import make_losses
 from policy_steps import policy_kl
 from safetac_point import policy_closure
@@ -27,7 +26,6 @@ from torchrl_safe.optim.curvature import (
     hessian_product,
 )
 
-EXAMPLES = Path(__file__).resolve().parents[1] / "examples"
 NUM_STATES = 5000
 CG_ITERS = 10
 
@@ -38,8 +36,7 @@ def make_closures(
     """Configuration, policy, states, and a maker of closures with an active constraint."""
     torch.manual_seed(0)
     widths = [f"policy.num_cells=[{width},{width}]", f"critic.num_cells=[{width},{width}]"]
-    with hydra.initialize_config_dir(str(EXAMPLES), version_base="1.3"):
-        cfg = hydra.compose("safetac_point", [*widths, "policy.num_components=5"])
+    cfg = compose([*widths, "policy.num_components=5"])
     env = SafeGoalEnv(num_envs=1, num_threads=1)
     policy = make_policy(cfg, env)
     losses = make_losses(cfg, env, policy)

@@ -24,17 +24,15 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "examples"))
 
 import collectors
 import critics
-import hydra
 import safetac_point
 import utils
-from bench_training import SILENT, warm_up_updates
+from bench_training import SILENT, compose, warm_up_updates
 from torch.autograd.profiler_util import FunctionEvent
 from torch.profiler import ProfilerActivity, profile, record_function
 from torchrl._utils import timeit
 
 from torchrl_safe.envs import _core
 
-EXAMPLES = Path(safetac_point.__file__).parent
 PARTS = {
     "collect": "collect: policy, environment, tensordicts",
     "replay": "replay: store and sample slices",
@@ -92,8 +90,7 @@ def record(overrides: list[str]) -> tuple[list[FunctionEvent], float, float]:
     Returns:
         tuple: the profiler's events, seconds of the profiled update, and of one without profiler.
     """
-    with hydra.initialize_config_dir(str(EXAMPLES), version_base="1.3"):
-        cfg = hydra.compose("safetac_point", ["num_threads=1", *overrides, *SILENT])
+    cfg = compose(["num_threads=1", *overrides, *SILENT])
     updates = warm_up_updates(cfg) + NUM_TIMED + 1  # the last one is profiled
     cfg.collector.total_frames = updates * cfg.collector.frames_per_batch
     profiler = profile(activities=[ProfilerActivity.CPU])

@@ -23,10 +23,9 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "examples"))
 
-import hydra
 import numpy as np
 import safetac_point
-from bench_training import SILENT, warm_up_updates
+from bench_training import SILENT, compose, warm_up_updates
 from collectors import make_collector
 from critics import REPLAYED, make_buffer
 from matplotlib.figure import Figure
@@ -36,7 +35,6 @@ from utils import make_env, make_policy
 from torchrl_safe.record import read_metrics
 
 ROOT = Path(__file__).resolve().parents[1]
-EXAMPLES = ROOT / "examples"
 TABLE = ROOT / "benchmarks" / "results" / "scaling.csv"
 PICTURE = ROOT / "docs" / "images" / "scaling.png"
 BASE = [
@@ -69,15 +67,14 @@ def overrides(axis: str, value: int) -> list[str]:
     return [f"policy.{cells}", f"critic.{cells}"]
 
 
-def compose(options: list[str], run_dir: str) -> DictConfig:
-    with hydra.initialize_config_dir(str(EXAMPLES), version_base="1.3"):
-        return hydra.compose("safetac_point", [*BASE, *options, *SILENT, f"run_dir={run_dir}"])
+def configuration(options: list[str], run_dir: str) -> DictConfig:
+    return compose([*BASE, *options, *SILENT, f"run_dir={run_dir}"])
 
 
 def training_cost(options: list[str]) -> dict[str, float]:
     """Microseconds per frame of each part of an update, medians."""
     with tempfile.TemporaryDirectory() as run_dir:
-        cfg = compose(options, run_dir)
+        cfg = configuration(options, run_dir)
         per_batch = cfg.collector.frames_per_batch
         # Every environment has slices to draw from when learning begins.
         cfg.collector.init_frames = 2 * cfg.replay_buffer.slice_len * cfg.env.num_envs
@@ -97,7 +94,7 @@ def training_cost(options: list[str]) -> dict[str, float]:
 def replay_cost(options: list[str], frames: int) -> dict[str, float]:
     """Microseconds per replayed frame of drawing slices from that many frames."""
     with tempfile.TemporaryDirectory() as run_dir:
-        cfg = compose([*options, f"replay_buffer.size={frames}"], run_dir)
+        cfg = configuration([*options, f"replay_buffer.size={frames}"], run_dir)
         per_batch = cfg.collector.frames_per_batch
         make = partial(make_env, cfg, episode_length=cfg.env.episode_length, stagger=True)
         policy = make_policy(cfg, make(num_envs=1, seed=0))

@@ -28,6 +28,8 @@ from pathlib import Path
 import numpy as np
 from omegaconf import OmegaConf
 
+from torchrl_safe.record import read_metrics
+
 MAX_MEMORY_GROWTH = 0.02
 MAX_SLOWDOWN = 0.1
 GONE = (FileNotFoundError, ProcessLookupError)  # a process that ends while it is read
@@ -111,9 +113,8 @@ def logged_frames(run_dir: Path) -> int:
 
 def logged_speed(run_dir: Path, since: int) -> np.ndarray:
     """Frames per second of the updates after ``since`` frames, [M]."""
-    with (run_dir / FRAMES_PER_SECOND).open() as file:
-        rows = [line.split(",") for line in file if line.endswith("\n")]
-    return np.array([float(speed) for frames, speed in rows if int(frames) > since])
+    frames, speed = read_metrics(run_dir / "log")["time/frames_per_second"]
+    return speed[frames > since]
 
 
 def tenths(values: Iterable[float]) -> tuple[float, float]:

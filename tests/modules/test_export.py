@@ -39,6 +39,19 @@ def example():
     return TensorDict(observation=torch.zeros(1, 5), batch_size=1)
 
 
+class Sum(nn.Module):
+    def __init__(self):
+        super().__init__()
+        self.first, self.second = nn.Linear(3, 5), nn.Linear(2, 5)
+
+    def forward(self, first, second):
+        return self.first(first) + self.second(second)
+
+
+def of_two_inputs():
+    return GMMTanhPolicy(Sum(), SPEC, num_components=1, in_keys=["scan", ("body", "pose")])
+
+
 @pytest.mark.parametrize("make", [mixture, gaussian])
 @pytest.mark.parametrize("batch", [1, 6])
 def test_parity(tmp_path, example, make, batch):
@@ -53,15 +66,7 @@ def test_parity(tmp_path, example, make, batch):
 
 
 def test_two_inputs(tmp_path):
-    class Sum(nn.Module):
-        def __init__(self):
-            super().__init__()
-            self.first, self.second = nn.Linear(3, 5), nn.Linear(2, 5)
-
-        def forward(self, first, second):
-            return self.first(first) + self.second(second)
-
-    policy = GMMTanhPolicy(Sum(), SPEC, num_components=1, in_keys=["scan", ("body", "pose")])
+    policy = of_two_inputs()
     example = TensorDict(
         {"scan": torch.zeros(1, 3), "body": {"pose": torch.zeros(1, 2)}}, batch_size=1
     )
@@ -75,16 +80,7 @@ def test_two_inputs(tmp_path):
 
 def test_onnx(tmp_path):
     """The inputs' names are the keys, joined; any number of states."""
-
-    class Sum(nn.Module):
-        def __init__(self):
-            super().__init__()
-            self.first, self.second = nn.Linear(3, 5), nn.Linear(2, 5)
-
-        def forward(self, first, second):
-            return self.first(first) + self.second(second)
-
-    policy = GMMTanhPolicy(Sum(), SPEC, num_components=1, in_keys=["scan", ("body", "pose")])
+    policy = of_two_inputs()
     data = TensorDict(
         {"scan": torch.randn(4, 3), "body": {"pose": torch.randn(4, 2)}}, batch_size=4
     )

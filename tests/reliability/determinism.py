@@ -60,14 +60,8 @@ def run_retrace_sac(folder: Path) -> None:
         retrace_sac.main.__wrapped__(hydra.compose("retrace_sac", overrides))
 
 
-def run_compose_tsallis(folder: Path) -> None:
-    episodes = compose_tsallis.train(entropic_index=1.4, seed=0, total_frames=1_100)
-    folder.mkdir()
-    (folder / "episodes.json").write_text(json.dumps(episodes))
-
-
-def run_compose_retrace(folder: Path) -> None:
-    episodes = compose_retrace.train(lmbda=0.9, seed=0, total_frames=1_100)
+def keep_episodes(train: Callable[..., list[tuple[int, float]]], folder: Path) -> None:
+    episodes = train(seed=0, total_frames=1_100)
     folder.mkdir()
     (folder / "episodes.json").write_text(json.dumps(episodes))
 
@@ -94,8 +88,8 @@ CASES: dict[str, Callable[[Path], None]] = {
     },
     "doggo_controller": doggo.launch,
     "retrace_sac": run_retrace_sac,
-    "compose_tsallis": run_compose_tsallis,
-    "compose_retrace": run_compose_retrace,
+    "compose_tsallis": partial(keep_episodes, partial(compose_tsallis.train, entropic_index=1.4)),
+    "compose_retrace": partial(keep_episodes, partial(compose_retrace.train, lmbda=0.9)),
     "compose_trpo": run_compose_trpo,
     "compose_constraint": partial(run_compose_trpo, limit=0.05),
     # Not one more example: what shows that a number can differ at all.

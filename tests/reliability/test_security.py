@@ -241,7 +241,10 @@ def test_wandb_sends_nothing_unless_asked(tmp_path):
     def accept():
         with contextlib.suppress(OSError):
             while True:
-                connections.append(server.accept()[0])
+                with server.accept()[0] as connection:
+                    connections.append(connection.recv(2**16))
+                    # Left without an answer, wandb's process may not end.
+                    connection.sendall(b"HTTP/1.1 401 No\r\nContent-Length: 0\r\n\r\n")
 
     thread = threading.Thread(target=accept, daemon=True)
     thread.start()
@@ -265,8 +268,6 @@ def test_wandb_sends_nothing_unless_asked(tmp_path):
     server.shutdown(socket.SHUT_RDWR)
     server.close()
     thread.join(10)
-    for connection in connections:
-        connection.close()
 
 
 @pytest.mark.parametrize("folder", ["torchrl_safe", "examples"])

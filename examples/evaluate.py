@@ -88,6 +88,8 @@ def main(run_dir: Path, episodes: int, seed: int, film: bool) -> dict[str, float
     policy = load_policy(run_dir)
     num_steps, out = cfg.eval.num_steps, run_dir / "evaluation"
     env = make_env(cfg, episodes, seed, episode_length=num_steps)
+    # Before the episodes: a run that still trains replaces its checkpoint meanwhile.
+    cost_loss = load_cost_loss(cfg, checkpoint, env, policy)
     metrics: dict[str, float] = {}
     for prefix, kind in (("det/", "DETERMINISTIC"), ("sampled/", "RANDOM")):
         played = evaluate(
@@ -99,7 +101,6 @@ def main(run_dir: Path, episodes: int, seed: int, film: bool) -> dict[str, float
         record_trajectories(env, policy, num_steps=num_steps, num_episodes=filmed, seed=seed),
         out / "trajectories.png",
     )
-    cost_loss = load_cost_loss(cfg, checkpoint, env, policy)
     if cost_loss is None:
         print("no calibration: only SafeTAC's safety critics are judged here")
     else:

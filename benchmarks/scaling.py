@@ -139,7 +139,7 @@ def plot() -> None:
         for part in parts:
             cost = {int(row["value"]): float(row["us"]) for row in mine if row["part"] == part}
             height = np.array([cost[value] for value in values])
-            names = [f"{value:,}" for value in values]
+            names = [f"{value:,}".replace(",000,000", "M").replace(",000", "k") for value in values]
             axes.bar(names, height, 0.7, bottom, label=part, color=COLOURS[part])
             bottom += height
         axes.set_xlabel(axis)

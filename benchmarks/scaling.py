@@ -29,6 +29,7 @@ from bench_training import SILENT, compose, warm_up_updates
 from collectors import make_collector
 from critics import REPLAYED, make_buffer
 from matplotlib.figure import Figure
+from matplotlib.ticker import EngFormatter
 from omegaconf import DictConfig
 from utils import make_env, make_policy
 
@@ -139,7 +140,7 @@ def plot() -> None:
         for part in parts:
             cost = {int(row["value"]): float(row["us"]) for row in mine if row["part"] == part}
             height = np.array([cost[value] for value in values])
-            names = [f"{value:,}".replace(",000,000", "M").replace(",000", "k") for value in values]
+            names = [EngFormatter(sep="")(value) for value in values]
             axes.bar(names, height, 0.7, bottom, label=part, color=COLOURS[part])
             bottom += height
         axes.set_xlabel(axis)

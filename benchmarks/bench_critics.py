@@ -14,6 +14,7 @@ from critics import make_critic_optim, make_losses, minibatches
 from descent import Descent
 from omegaconf import DictConfig
 from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import CudaGraphModule
 from torch import nn
 from utils import make_policy
 
@@ -33,12 +34,12 @@ def make_data(num_frames: int, observation_dim: int, action_dim: int) -> TensorD
 
 
 def with_losses(
-    cfg: DictConfig, env: SafeGoalEnv, data: TensorDict, vmap: bool, compiled: bool = False
+    cfg: DictConfig, env: SafeGoalEnv, data: TensorDict, how: str
 ) -> Callable[[], None]:
     """The losses of the library, over networks one by one or by vmap."""
     reward_loss, cost_loss = make_losses(cfg, env, make_policy(cfg, env))
     for loss in (reward_loss, cost_loss):
-        loss.deactivate_vmap = not vmap
+        loss.deactivate_vmap = how != "losses_vmap"
         loss._make_vmap()
     descent = Descent(cfg, make_critic_optim(cfg, reward_loss, cost_loss))
 
@@ -47,14 +48,16 @@ def with_losses(
         losses["loss_qvalue"], _ = reward_loss.qvalue_v2_loss(minibatch)
         return losses
 
-    if compiled:
+    if how == "losses_compiled":
         losses_of = torch.compile(losses_of)
 
-    def one_round() -> None:
+    def one_round(data: TensorDict) -> None:
         for minibatch in minibatches(data, cfg.optim.minibatch_size):
             descent.step(losses_of(minibatch))
 
-    return one_round
+    if how == "losses_cuda_graph":
+        one_round = CudaGraphModule(one_round, in_keys=[])
+    return lambda: one_round(data)
 
 
 def plain(cfg: DictConfig, env: SafeGoalEnv, data: TensorDict) -> Callable[[], None]:
@@ -70,13 +73,14 @@ def plain(cfg: DictConfig, env: SafeGoalEnv, data: TensorDict) -> Callable[[], N
         return nn.Sequential(*hidden, nn.Linear(sizes[-1], 1), *last)
 
     networks = [network(), network(), network(), network(nn.Softplus())]
+    networks = [each.to(cfg.device) for each in networks]
     params = [p for each in networks for p in each.parameters()]
     optim = torch.optim.Adam(params, lr=cfg.optim.critic_lr, fused=True)
     inputs = torch.cat([data["observation"], data["action"]], -1)
     targets = [data[name] for name in ("value_target", "value_target", "cost_target", "std_target")]
 
     def one_round() -> None:
-        order = torch.randperm(len(inputs))
+        order = torch.randperm(len(inputs), device=cfg.device)
         batches = [tensor[order].split(cfg.optim.minibatch_size) for tensor in (inputs, *targets)]
         for batch, *wanted in zip(*batches, strict=True):
             pairs = zip(networks, wanted, strict=True)
@@ -89,21 +93,20 @@ def plain(cfg: DictConfig, env: SafeGoalEnv, data: TensorDict) -> Callable[[], N
     return one_round
 
 
-@pytest.mark.parametrize("how", ["losses", "losses_vmap", "losses_compiled", "plain"])
+@pytest.mark.parametrize(
+    "how", ["losses", "losses_vmap", "losses_compiled", "losses_cuda_graph", "plain"]
+)
 @pytest.mark.parametrize("width", [64, 128, 256], ids="{0}-{0}".format)
-def bench_round(benchmark: Any, width: int, how: str) -> None:
+def bench_round(benchmark: Any, device: str, timed: Any, width: int, how: str) -> None:
     """One round, from targets to the last gradient step."""
+    if how == "losses_cuda_graph" and device == "cpu":
+        pytest.skip("a CUDA graph is a GPU's")
     torch.manual_seed(0)
-    cfg = compose([f"critic.num_cells=[{width},{width}]"])
-    env = SafeGoalEnv(num_envs=1, num_threads=1)
-    data = make_data(cfg.optim.critic_frames, 24, env.action_spec.shape[-1])
+    cfg = compose([f"critic.num_cells=[{width},{width}]", f"device={device}"])
+    env = SafeGoalEnv(num_envs=1, num_threads=1, device=device)
+    data = make_data(cfg.optim.critic_frames, 24, env.action_spec.shape[-1]).to(device)
     benchmark.group = (
         f"critics {width}-{width}, {len(data):,} frames in steps of {cfg.optim.minibatch_size:,}"
     )
-    if how == "plain":
-        one_round = plain(cfg, env, data)
-    else:
-        one_round = with_losses(
-            cfg, env, data, vmap=how == "losses_vmap", compiled=how == "losses_compiled"
-        )
-    benchmark.pedantic(one_round, rounds=5, warmup_rounds=2)
+    one_round = plain(cfg, env, data) if how == "plain" else with_losses(cfg, env, data, how)
+    benchmark.pedantic(timed(one_round), rounds=5, warmup_rounds=3)

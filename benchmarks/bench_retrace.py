@@ -35,18 +35,23 @@ def retrace_loop(
 @pytest.mark.parametrize("implementation", ["retrace", "retrace_loop", "td_lambda_torchrl"])
 @pytest.mark.parametrize("shape", [(64, 1000), (5, 200)], ids="{0[0]}x{0[1]}".format)
 @torch.no_grad()
-def bench_targets(benchmark: Any, shape: tuple[int, int], implementation: str) -> None:
+def bench_targets(
+    benchmark: Any, device: str, timed: Any, shape: tuple[int, int], implementation: str
+) -> None:
     """Targets of trajectories [B, T]; what they cost apart from the networks."""
     benchmark.group = f"targets of {shape[0]} trajectories of {shape[1]} steps"
     torch.manual_seed(0)
     log_pi, log_mu, value, next_value, reward = torch.randn(5, *shape, 1).unbind()
     done = torch.rand(*shape, 1) < 0.01
     terminated = done & (torch.rand(*shape, 1) < 0.5)
-    data = (log_pi, log_mu, value, next_value, reward, done, terminated)
+    data = [
+        tensor.to(device)
+        for tensor in (log_pi, log_mu, value, next_value, reward, done, terminated)
+    ]
     if implementation == "retrace":
-        target = benchmark(retrace_lambda_return_estimate, GAMMA, LMBDA, *data)
+        target = benchmark(timed(retrace_lambda_return_estimate), GAMMA, LMBDA, *data)
         torch.testing.assert_close(target, retrace_loop(*data))
     elif implementation == "retrace_loop":
-        benchmark(retrace_loop, *data)
+        benchmark(timed(retrace_loop), *data)
     else:
-        benchmark(vec_td_lambda_return_estimate, GAMMA, LMBDA, *data[3:])
+        benchmark(timed(vec_td_lambda_return_estimate), GAMMA, LMBDA, *data[3:])

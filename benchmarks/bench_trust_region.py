@@ -32,16 +32,17 @@ CG_ITERS = 10
 
 def make_closures(
     width: int,
+    device: str,
 ) -> tuple[Any, GMMTanhPolicy, TensorDict, Callable[..., Callable[[], TensorDict]]]:
     """Configuration, policy, states, and a maker of closures with an active constraint."""
     torch.manual_seed(0)
     widths = [f"policy.num_cells=[{width},{width}]", f"critic.num_cells=[{width},{width}]"]
-    cfg = compose([*widths, "policy.num_components=5"])
-    env = SafeGoalEnv(num_envs=1, num_threads=1)
+    cfg = compose([*widths, "policy.num_components=5", f"device={device}"])
+    env = SafeGoalEnv(num_envs=1, num_threads=1, device=device)
     policy = make_policy(cfg, env)
     losses = make_losses(cfg, env, policy)
-    states = TensorDict({"observation": torch.randn(NUM_STATES, 24)}, [NUM_STATES])
-    level = torch.tensor(cfg.loss.cost_limit)
+    states = TensorDict({"observation": torch.randn(NUM_STATES, 24)}, [NUM_STATES]).to(device)
+    level = torch.tensor(cfg.loss.cost_limit, device=device)
 
     def closure_of(curvature_frames: int | None = None) -> Callable[[], TensorDict]:
         torch.manual_seed(0)
@@ -89,10 +90,12 @@ def rebuilt_hessian_product(policy: GMMTanhPolicy, states: TensorDict) -> Produc
     ["gauss_newton", "gauss_newton_quarter", "double_backward", "double_backward_rebuilt"],
 )
 @pytest.mark.parametrize("width", [128, 512], ids="24-{0}-{0}".format)
-def bench_natural_gradients(benchmark: Any, width: int, curvature: str) -> None:
+def bench_natural_gradients(
+    benchmark: Any, device: str, timed: Any, width: int, curvature: str
+) -> None:
     """Conjugate gradients for g and b, from the closure's outputs to both solutions."""
     benchmark.group = f"natural gradients of g and b, 24-{width}-{width}, {NUM_STATES} states"
-    cfg, policy, states, closure_of = make_closures(width)
+    cfg, policy, states, closure_of = make_closures(width, device)
     params = list(policy.parameters())
     out = closure_of(NUM_STATES // 4)()
     old = out["statistics"].detach().clone()
@@ -113,7 +116,7 @@ def bench_natural_gradients(benchmark: Any, width: int, curvature: str) -> None:
         damping = cfg.optim.damping
         return conjugate_gradient(lambda v: product(v) + damping * v, rhs, CG_ITERS).solution
 
-    solution = benchmark.pedantic(solve, args=(make_product,), rounds=3, warmup_rounds=1)
+    solution = benchmark.pedantic(timed(solve), args=(make_product,), rounds=3, warmup_rounds=1)
     exact = solve(lambda: hessian_product(policy_kl(old, out["statistics"]), params))
     cosine = torch.cosine_similarity(solution, exact).min().item()
     benchmark.extra_info["smallest cosine to double backward"] = round(cosine, 6)
@@ -122,10 +125,10 @@ def bench_natural_gradients(benchmark: Any, width: int, curvature: str) -> None:
 
 @pytest.mark.parametrize("curvature", ["gauss_newton", "gauss_newton_quarter", "double_backward"])
 @pytest.mark.parametrize("width", [128, 512], ids="24-{0}-{0}".format)
-def bench_step(benchmark: Any, width: int, curvature: str) -> None:
+def bench_step(benchmark: Any, device: str, timed: Any, width: int, curvature: str) -> None:
     """One step from the same weights on the same states, line search included."""
     benchmark.group = f"trust-region step, 24-{width}-{width}, 5 Gaussians, {NUM_STATES} states"
-    cfg, policy, _, closure_of = make_closures(width)
+    cfg, policy, _, closure_of = make_closures(width, device)
     optim = TrustRegionSafeOptimizer(
         policy.parameters(),
         max_kl=cfg.optim.max_kl,
@@ -141,7 +144,7 @@ def bench_step(benchmark: Any, width: int, curvature: str) -> None:
         closure = closure_of(NUM_STATES // 4 if curvature == "gauss_newton_quarter" else None)
         return (in_terms_of_kl(closure) if curvature == "double_backward" else closure,), {}
 
-    report = benchmark.pedantic(optim.step, setup=setup, rounds=3, warmup_rounds=1)
+    report = benchmark.pedantic(timed(optim.step), setup=setup, rounds=3, warmup_rounds=1)
     benchmark.extra_info |= {
         "case": report.case,
         "backtracks": report.backtracks,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -9,6 +10,7 @@ import torch
 from descent import Descent
 from omegaconf import DictConfig
 from tensordict import TensorDictBase
+from tensordict.nn import CudaGraphModule
 from torch import nn
 from torchrl._utils import timeit
 from torchrl.data import (
@@ -73,7 +75,8 @@ def make_critic_optim(
         cost_loss.std_network_params,
     )
     params = [param for critic in critics for param in critic.parameters()]
-    return torch.optim.Adam(params, lr=cfg.optim.critic_lr, fused=True)
+    on_gpu = torch.device(cfg.device).type == "cuda"
+    return torch.optim.Adam(params, lr=cfg.optim.critic_lr, fused=True, capturable=on_gpu)
 
 
 def make_buffer(cfg: DictConfig) -> TensorDictReplayBuffer:
@@ -96,28 +99,69 @@ def make_buffer(cfg: DictConfig) -> TensorDictReplayBuffer:
     )
 
 
-def fit_critics(
-    cfg: DictConfig,
-    buffer: TensorDictReplayBuffer,
-    reward_loss: TsallisLoss,
-    cost_loss: CVaRCostLoss,
-    critic_optim: torch.optim.Optimizer,
-) -> dict[str, float]:
-    """Some rounds of new targets, each with one pass of gradient steps over its transitions."""
-    descent = Descent(cfg, critic_optim)
-    for _ in range(cfg.optim.critic_rounds):
-        # Targets are renewed each round: one round is one step of value iteration.
-        with timeit("time/targets"):
-            data = buffer.sample(cfg.optim.critic_frames).reshape(-1, cfg.replay_buffer.slice_len)
-            data = with_targets(data, reward_loss, cost_loss)
-        with timeit("time/critics"):
+class CriticFit:
+    """The critics' part of an update: some rounds of new targets, each with one pass over them.
+
+    On a GPU the targets of a round are one CUDA graph and its gradient steps another: they are
+    thousands of small kernels, which would wait for Python to launch them one by one. The first
+    two rounds, which run as on a CPU, settle what is settled once.
+
+    Args:
+        cfg (DictConfig): the run's configuration.
+        buffer (TensorDictReplayBuffer): replays trajectories.
+        reward_loss (TsallisLoss): critics of the reward.
+        cost_loss (CVaRCostLoss): critics of the cost.
+        optim (torch.optim.Optimizer): of both, fused.
+    """
+
+    def __init__(
+        self,
+        cfg: DictConfig,
+        buffer: TensorDictReplayBuffer,
+        reward_loss: TsallisLoss,
+        cost_loss: CVaRCostLoss,
+        optim: torch.optim.Optimizer,
+    ) -> None:
+        self.cfg = cfg
+        self.buffer = buffer
+        self.descent = Descent(cfg, optim)
+
+        def add_targets(trajectories: TensorDictBase) -> TensorDictBase:
+            return with_targets(trajectories, reward_loss, cost_loss)
+
+        def descend(data: TensorDictBase) -> TensorDictBase:
             for minibatch in minibatches(data, cfg.optim.minibatch_size):
-                loss_qvalue, _ = reward_loss.qvalue_v2_loss(minibatch)
                 losses = cost_loss(minibatch)
-                losses["loss_qvalue"] = loss_qvalue
-                descent.step(losses)
-    metrics = {f"update/{name}": value.item() for name, value in losses.items()}
-    return metrics | {"update/skipped_steps": float(descent.skipped)}
+                losses["loss_qvalue"], _ = reward_loss.qvalue_v2_loss(minibatch)
+                self.descent.step(losses)
+            return losses.detach()
+
+        self._add_targets, self._descend = add_targets, descend
+        if torch.device(cfg.device).type == "cuda" and cfg.optim.cuda_graphs:
+            # A graph is recorded on a stream of its own, and CudaGraphModule takes tensordicts out
+            # of PyTree, where nothing here needs them.
+            warnings.filterwarnings("ignore", "The AccumulateGrad node's stream")
+            warnings.filterwarnings("ignore", "Tensordict is registered in PyTree")
+            self._add_targets, self._descend = (
+                CudaGraphModule(function, in_keys=[]) for function in (add_targets, descend)
+            )
+
+    def __call__(self) -> dict[str, float]:
+        """Fit the critics to what is in the buffer.
+
+        Raises:
+            FloatingPointError: if more than ``optim.max_skipped`` gradient steps were skipped.
+        """
+        cfg = self.cfg
+        for _ in range(cfg.optim.critic_rounds):
+            # Targets are renewed each round: one round is one step of value iteration.
+            with timeit("time/targets"):
+                data = self.buffer.sample(cfg.optim.critic_frames).select(*REPLAYED)
+                data = self._add_targets(data.reshape(-1, cfg.replay_buffer.slice_len))
+            with timeit("time/critics"):
+                losses = self._descend(data)
+        metrics = {f"update/{name}": value.item() for name, value in losses.items()}
+        return metrics | {"update/skipped_steps": self.descent.count()}
 
 
 def with_targets(

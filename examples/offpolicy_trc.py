@@ -10,6 +10,7 @@ from __future__ import annotations
 import hydra
 import torch
 from critics import REPLAYED, make_buffer
+from descent import Descent
 from omegaconf import DictConfig
 from policy_steps import cost_limit_at, make_trust_region
 from surrogates import fit_critics, make_surrogates, policy_step, with_advantages
@@ -25,6 +26,7 @@ def main(cfg: DictConfig) -> None:
     eval_env = make_env(cfg, cfg.eval.num_episodes, EVAL_SEED)
     policy = make_policy(cfg, eval_env)
     reward_loss, cost_loss, critic_optim = make_surrogates(cfg, eval_env)
+    descent = Descent(cfg, critic_optim)
     policy_optim = make_trust_region(cfg, policy)
     buffer = make_buffer(cfg)
     run = Run(
@@ -52,7 +54,7 @@ def main(cfg: DictConfig) -> None:
         with timeit("time/critics"):
             for _ in range(cfg.optim.critic_rounds):
                 data = with_advantages(replay(cfg.optim.critic_frames), reward_loss, cost_loss)
-                losses = fit_critics(cfg, data, reward_loss, cost_loss, critic_optim)
+                losses = fit_critics(cfg, data, reward_loss, cost_loss, descent)
         with timeit("time/policy"):
             data = with_advantages(replay(cfg.optim.policy_frames), reward_loss, cost_loss)
             step = policy_step(policy, policy_optim, reward_loss, cost_loss, data, batch)

@@ -97,6 +97,7 @@ def main(cfg: DictConfig) -> None:
         loss.make_value_estimator(cfg.estimator.name, gamma=gamma)
     target_updater = SoftUpdate(loss, tau=cfg.loss.target_update_tau)
     optim = torch.optim.Adam(loss.parameters(), lr=cfg.optim.lr, fused=True)
+    descent = Descent(cfg, optim)
 
     # Slices come flat, [B * T], with done at the end of each: that is where the traces stop.
     buffer = TensorDictReplayBuffer(
@@ -135,12 +136,12 @@ def main(cfg: DictConfig) -> None:
             if ended.any():
                 row["train_return"] = batch["next", "episode_reward"][ended].mean().item()
             if frames >= cfg.collector.init_frames:
-                descent = Descent(cfg, optim)
                 for _ in range(updates):
                     sample = buffer.sample()
                     losses = loss(sample)
-                    if descent.step(losses):
-                        target_updater.step()
+                    descent.step(losses)
+                    target_updater.step()
+                descent.count()
                 row |= {name: losses[name].item() for name in ("alpha", "loss_qvalue")}
                 row["trace"] = mean_trace(actor, sample).item()
             if frames % cfg.eval.interval == 0:

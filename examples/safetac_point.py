@@ -15,7 +15,7 @@ import hydra
 import torch
 from critics import (
     REPLAYED,
-    fit_critics,
+    CriticFit,
     make_buffer,
     make_critic_optim,
     make_losses,
@@ -86,11 +86,15 @@ def main(cfg: DictConfig) -> None:
     reward_loss, cost_loss = make_losses(cfg, eval_env, policy)
     critic_optim = make_critic_optim(cfg, reward_loss, cost_loss)
     buffer = make_buffer(cfg)
+    fit_critics = CriticFit(cfg, buffer, reward_loss, cost_loss, critic_optim)
     components = {}
     if cfg["update"] == "trust_region":  # as an attribute, update is a method of the configuration
         policy_optim = make_trust_region(cfg, policy)
     else:  # (9), the ablation
-        policy_optim = torch.optim.Adam(policy.parameters(), lr=cfg.lagrangian.policy_lr)
+        policy_optim = torch.optim.Adam(
+            policy.parameters(), lr=cfg.lagrangian.policy_lr, fused=True
+        )
+        descent = Descent(cfg, policy_optim)
         components["multiplier"] = multiplier = Multiplier(cfg, cfg["update"])
     run = Run(
         cfg,
@@ -109,7 +113,7 @@ def main(cfg: DictConfig) -> None:
             return {}
         limit = cost_limit_at(cfg, run.frames)
         cost_loss.cost_limit.fill_(limit)
-        metrics = fit_critics(cfg, buffer, reward_loss, cost_loss, critic_optim)
+        metrics = fit_critics()
         with timeit("time/policy"):
             visited = batch.select("observation").flatten()
             level = cost_loss.on_policy_cvar(batch)
@@ -122,11 +126,10 @@ def main(cfg: DictConfig) -> None:
                 metrics |= policy_optim.step(closure).to_dict()
             else:
                 multiplier.update((level - limit)[None])
-                descent = Descent(cfg, policy_optim)
                 for states in minibatches(visited, cfg.lagrangian.minibatch_size):
                     closure = policy_closure(policy, reward_loss, cost_loss, states)
                     metrics |= ascend(descent, closure, multiplier())
-                metrics["update/skipped_steps"] += descent.skipped
+                metrics["update/skipped_steps"] += descent.count()
         return {**metrics, "update/constraint": level.item(), "update/cost_limit": limit}
 
     train(run, policy, update, eval_env)

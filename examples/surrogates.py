@@ -47,15 +47,14 @@ def fit_critics(
     data: TensorDictBase,
     reward_loss: ReturnSurrogateLoss,
     cost_loss: CVaRSurrogateLoss,
-    critic_optim: torch.optim.Optimizer,
+    descent: Descent,
 ) -> dict[str, float]:
     """One pass of gradient steps over steps with their targets."""
-    descent = Descent(cfg, critic_optim)
     for minibatch in minibatches(data, cfg.optim.minibatch_size):
         losses = cost_loss(minibatch).update(reward_loss(minibatch))
         descent.step(losses)
     metrics = {f"update/{name}": value.item() for name, value in losses.items()}
-    return metrics | {"update/skipped_steps": float(descent.skipped)}
+    return metrics | {"update/skipped_steps": descent.count()}
 
 
 def surrogate_closure(

@@ -37,7 +37,8 @@ def main(cfg: DictConfig) -> None:
     )
     loss.make_value_estimator(gamma=cfg.loss.gamma)
     target = SoftUpdate(loss, tau=cfg.optim.tau)
-    optim = torch.optim.Adam(loss.parameters(), lr=cfg.optim.lr)
+    optim = torch.optim.Adam(loss.parameters(), lr=cfg.optim.lr, fused=True)
+    descent = Descent(cfg, optim)
     buffer = TensorDictReplayBuffer(
         storage=LazyTensorStorage(cfg.replay_buffer.size, device=cfg.device),
         batch_size=cfg.optim.minibatch_size,
@@ -49,14 +50,13 @@ def main(cfg: DictConfig) -> None:
         buffer.extend(batch.select(*REPLAYED).flatten())
         if run.frames < cfg.collector.init_frames:
             return {}
-        descent = Descent(cfg, optim)
         with timeit("time/update"):
             for _ in range(cfg.optim.num_updates):
                 losses = loss(buffer.sample())
-                if descent.step(losses):
-                    target.step()
+                descent.step(losses)
+                target.step()
         metrics = {f"update/{name}": value.item() for name, value in losses.items()}
-        return metrics | {"update/skipped_steps": float(descent.skipped)}
+        return metrics | {"update/skipped_steps": descent.count()}
 
     train(run, policy, update, eval_env)
 

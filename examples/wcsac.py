@@ -52,7 +52,8 @@ def run_wcsac(cfg: DictConfig) -> None:
     targets = [SoftUpdate(loss, tau=cfg.optim.tau) for loss in (reward_loss, cost_loss)]
     # The policy's parameters are in both losses.
     params = dict.fromkeys([*reward_loss.parameters(), *cost_loss.parameters()])
-    optim = torch.optim.Adam(list(params), lr=cfg.optim.lr)
+    optim = torch.optim.Adam(list(params), lr=cfg.optim.lr, fused=True)
+    descent = Descent(cfg, optim)
     multiplier = Multiplier(cfg, "lagrangian")
     buffer = TensorDictReplayBuffer(
         storage=LazyTensorStorage(cfg.replay_buffer.size, device=cfg.device),
@@ -76,7 +77,6 @@ def run_wcsac(cfg: DictConfig) -> None:
         cost_loss.cost_limit.fill_(limit)
         level = cost_loss.on_policy_cvar(batch)
         multiplier.update((level - limit)[None])
-        descent = Descent(cfg, optim)
         with timeit("time/update"):
             for _ in range(cfg.optim.num_updates):
                 minibatch = buffer.sample()
@@ -90,13 +90,13 @@ def run_wcsac(cfg: DictConfig) -> None:
                 )
                 entropy = -q_logarithm(log_prob.detach(), cfg.loss.entropic_index)
                 losses["loss_alpha"] = reward_loss.alpha_loss(-entropy).mean()
-                if descent.step(losses):
-                    for target in targets:
-                        target.step()
+                descent.step(losses)
+                for target in targets:
+                    target.step()
         metrics = {f"update/{name}": value.item() for name, value in losses.items()}
         return {
             **metrics,
-            "update/skipped_steps": float(descent.skipped),
+            "update/skipped_steps": descent.count(),
             "update/constraint": level.item(),
             "update/cost_limit": limit,
             "update/multiplier": multiplier().item(),

@@ -1,9 +1,11 @@
-"""Turns finished cells into a table, learning curves and the frontier of score and violations.
+"""Turns finished cells into tables, learning curves and the frontier of score and violations.
 
     python benchmarks/paper/make_table.py runs/paper/point benchmarks/results/paper/point
 
-reads ``<method>/seed_<n>`` below the first folder and writes into the second: ``table.md``,
-``curves.png``, ``frontier.png``, and each run's curves, configuration and commit (keep_run.py).
+reads ``<method>/seed_<n>`` below the first folder, which is named after the robot, and writes into
+the second: ``table.md`` with the paper's figures beside; ``claims.md``, the paper's claims about
+its figures, with the same differences here; ``table_1.png`` and ``table_3.png``, learning curves;
+``frontier.png``; and each run's curves, configuration and commit (keep_run.py).
 
 The interquartile mean and the stratified bootstrap are those of Agarwal et al. 2021
 (https://arxiv.org/abs/2108.13264).
@@ -23,17 +25,62 @@ from scipy.stats import trim_mean
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 from keep_run import keep_run
+from run_table import TABLES
 
 from torchrl_safe.record import read_metrics
 
-PAPER = {  # Table I on Point: score, CV per step
-    "SafeTAC q=1.4": (8.4, 0.009),
-    "SafeTAC q=1.2": (10.4, 0.007),
-    "SafeTAC q=1.0": (10.1, 0.008),
-    "TRC": (13.0, 0.003),
-    "WCSAC": (-0.2, 0.015),
-    "CPO": (8.0, 0.021),
+# Score and CV per step of Tables I and III.
+PAPER: dict[str, dict[str, tuple[float, float]]] = {
+    "point": {
+        "safetac_q14": (8.4, 0.009),
+        "safetac_q12": (10.4, 0.007),
+        "safetac_q10": (10.1, 0.008),
+        "trc": (13.0, 0.003),
+        "wcsac": (-0.2, 0.015),
+        "cpo": (8.0, 0.021),
+        "safetac_k3": (10.57, 0.002),
+        "safetac_k5": (11.78, 0.005),
+        "safetac_lmbda0": (-0.02, 0.026),
+        "safetac_lagrangian": (-0.15, 0.007),
+    },
+    "car": {
+        "safetac_q14": (14.5, 0.005),
+        "safetac_q12": (18.2, 0.002),
+        "safetac_q10": (18.7, 0.002),
+        "trc": (15.9, 0.002),
+        "wcsac": (5.4, 0.003),
+        "cpo": (12.5, 0.011),
+    },
+    "doggo": {
+        "safetac_q14": (13.9, 0.001),
+        "safetac_q12": (13.6, 0.002),
+        "safetac_q10": (13.1, 0.002),
+        "trc": (11.0, 0.004),
+        "wcsac": (10.5, 0.001),
+        "cpo": (6.0, 0.020),
+    },
+    "jackal": {
+        "safetac_q14": (8.02, 0.040),
+        "safetac_q12": (8.22, 0.022),
+        "safetac_q10": (4.49, 0.066),
+        "trc": (9.24, 0.007),
+        "wcsac": (2.86, 0.004),
+        "cpo": (6.81, 0.072),
+    },
 }
+SCORE, CV = "eval/score", "eval/cv_rate"
+CLAIMS = [  # of the paper: the first method has more of the quantity than the second
+    ("SafeTAC scores more than CPO", SCORE, "safetac_q12", "cpo"),
+    ("SafeTAC scores more than WCSAC", SCORE, "safetac_q12", "wcsac"),
+    ("TRC scores more than SafeTAC (on Point)", SCORE, "trc", "safetac_q12"),
+    ("CPO violates more than SafeTAC", CV, "cpo", "safetac_q12"),
+    ("K = 5 scores more than K = 1", SCORE, "safetac_k5", "safetac_q12"),
+    ("K = 1 violates more than K = 5", CV, "safetac_q12", "safetac_k5"),
+    ("q = 1.2 scores more than q = 1.4", SCORE, "safetac_q12", "safetac_q14"),
+    ("q = 1.2 scores more than q = 1", SCORE, "safetac_q12", "safetac_q10"),
+    ("lambda = .97 scores more than 0", SCORE, "safetac_q10", "safetac_lmbda0"),
+    ("the trust region scores more than Lagrange", SCORE, "safetac_q10", "safetac_lagrangian"),
+]
 COLUMNS = {
     "score": "eval/score",
     "score, det.": "eval/det/score",
@@ -83,12 +130,13 @@ def read_results(root: Path) -> dict[str, list[dict[str, float]]]:
     return out
 
 
-def table(results: Mapping[str, Sequence[Mapping[str, float]]]) -> str:
+def table(
+    results: Mapping[str, Sequence[Mapping[str, float]]],
+    paper: Mapping[str, tuple[float, float]],
+) -> str:
     """A row per method, each cell mean and IQM over seeds with the interval of the IQM."""
-    lines = [
-        "| method | seeds | frames | " + " | ".join(COLUMNS) + " |",
-        "|---" * (3 + len(COLUMNS)) + "|",
-    ]
+    head = ["method", "seeds", "frames", *COLUMNS, "paper: score / CV"]
+    lines = ["| " + " | ".join(head) + " |", "|---" * len(head) + "|"]
     for method, runs in results.items():
         cells = [method, str(len(runs)), f"{min(run['frames'] for run in runs):,}"]
         for key in COLUMNS.values():
@@ -96,12 +144,42 @@ def table(results: Mapping[str, Sequence[Mapping[str, float]]]) -> str:
             low, high = stratified_interval([values], iqm)
             spread = "" if np.isnan(low) else f", IQM {iqm(values):.4g} ({low:.4g} to {high:.4g})"
             cells.append(f"{values.mean():.4g}{spread}")
+        cells.append("{:.4g} / {:.3f}".format(*paper[method]) if method in paper else "-")
         lines.append("| " + " | ".join(cells) + " |")
     return "\n".join(lines) + "\n"
 
 
-def plot_curves(root: Path, path: Path) -> None:
-    """Training return, violations and cost of every run, a colour per method."""
+def claims(
+    results: Mapping[str, Sequence[Mapping[str, float]]],
+    paper: Mapping[str, tuple[float, float]],
+) -> str:
+    """A row per claim: the paper's difference of means and the one here with its interval.
+
+    A claim holds if the interval is above zero, fails if it is below, and is open otherwise, as
+    with a single seed. With few seeds the interval is narrower than what other seeds would give.
+    """
+    lines = ["| claim | paper | here (95 %) | |", "|---" * 4 + "|"]
+    for text, key, more, less in CLAIMS:
+        if not {more, less} <= results.keys() & paper.keys():
+            continue
+        published = np.subtract(*(paper[name][key == CV] for name in (more, less)))
+        pair = [np.array([run[key] for run in results[name]], float) for name in (more, less)]
+        split = len(pair[0])
+
+        def difference(values: np.ndarray, split: int = split) -> float:
+            return float(values[:split].mean() - values[split:].mean())
+
+        low, high = stratified_interval(pair, difference)
+        verdict = "holds" if low > 0 else "fails" if high < 0 else "open"
+        if min(map(len, pair)) < 2:
+            verdict = "open"
+        here = f"{difference(np.concatenate(pair)):+.3g} ({low:+.3g} to {high:+.3g})"
+        lines.append(f"| {text} | {published:+.3g} | {here} | {verdict} |")
+    return "\n".join(lines) + "\n"
+
+
+def plot_curves(root: Path, methods: Sequence[str], path: Path) -> None:
+    """Training return and violations, a colour per method: means over seeds, and their range."""
     panels = {
         "train/reward_per_1000": "return of 1,000 steps",
         "train/cv_rate": "violations per step",
@@ -109,43 +187,71 @@ def plot_curves(root: Path, path: Path) -> None:
     }
     figure = Figure(figsize=(13, 4), layout="constrained")
     axes = figure.subplots(1, len(panels))
-    for number, method in enumerate(sorted(read_results(root))):
-        for seed, results in enumerate(sorted(root.glob(f"{method}/seed_*/results.json"))):
-            metrics = read_metrics(results.with_name("log"))
-            for axis, (name, label) in zip(axes, panels.items(), strict=True):
-                if name in metrics:
-                    axis.plot(
-                        *metrics[name],
-                        color=f"C{number % 10}",
-                        ls=("-", "--")[number // 10],
-                        lw=1,
-                        label=None if seed else method,
-                    )
-                axis.set(xlabel="frames", ylabel=label)
+    for number, method in enumerate(methods):
+        runs = [
+            read_metrics(results.with_name("log"))
+            for results in sorted(root.glob(f"{method}/seed_*/results.json"))
+        ]
+        for axis, (name, label) in zip(axes, panels.items(), strict=True):
+            curves = [run[name] for run in runs if name in run]
+            axis.set(xlabel="frames", ylabel=label)
+            if not curves:
+                continue
+            frames = curves[0][0]
+            values = [np.interp(frames, *curve) for curve in curves]
+            smooth = np.stack([smoothed(value) for value in values])
+            color = f"C{number % 10}"
+            axis.plot(frames, smooth.mean(0), color=color, lw=1.5, label=method)
+            axis.fill_between(frames, smooth.min(0), smooth.max(0), color=color, alpha=0.15, lw=0)
     axes[0].legend(fontsize=7)
     figure.savefig(path, dpi=120)
 
 
-def plot_frontier(results: Mapping[str, Sequence[Mapping[str, float]]], path: Path) -> None:
+def smoothed(values: np.ndarray, width: int = 9) -> np.ndarray:
+    """Running means over ``width`` points, fewer at the ends."""
+    kernel = np.ones(min(width, len(values)))
+    total = np.convolve(values, kernel, "same")
+    return total / np.convolve(np.ones_like(values), kernel, "same")
+
+
+def plot_frontier(
+    results: Mapping[str, Sequence[Mapping[str, float]]],
+    paper: Mapping[str, tuple[float, float]],
+    path: Path,
+) -> None:
     """Score against violations: a line per method through its cost limits, the paper's points."""
-    lines: dict[str, list[tuple[float, float]]] = {}
-    for name, runs in results.items():
-        point = tuple(np.mean([run[key] for run in runs]) for key in ("eval/cv_rate", "eval/score"))
-        lines.setdefault(name.split("_limit")[0], []).append(point)
-    figure = Figure(figsize=(7, 5), layout="constrained")
+    lines: dict[str, list[tuple[float, float, str]]] = {}
+    figure = Figure(figsize=(8, 6), layout="constrained")
     axis = figure.subplots()
-    for name, points in lines.items():
-        axis.plot(*zip(*sorted(points), strict=True), "o-", label=name)
-    for name, (value, cv) in PAPER.items():
-        axis.plot(cv, value, "kx")
-        axis.annotate(f"{name} (paper)", (cv, value), fontsize=7)
-    axis.set(xlabel="violations per step", ylabel="score")
+    for name, runs in results.items():
+        method, _, limit = name.partition("_limit")
+        cv, score = (float(np.mean([run[key] for run in runs])) for key in (CV, SCORE))
+        lines.setdefault(method, []).append((cv, score, limit))
+    for number, (method, points) in enumerate(lines.items()):
+        color, style = f"C{number % 10}", "os^"[number // 10]
+        axis.plot(
+            *zip(*[point[:2] for point in sorted(points)], strict=True),
+            f"{style}-",
+            color=color,
+            label=method,
+        )
+        for name, runs in results.items():
+            if name.partition("_limit")[0] == method:
+                dots = [[run[key] for run in runs] for key in (CV, SCORE)]
+                axis.plot(*dots, style, color=color, ms=3, alpha=0.4)
+        for cv, score, limit in points:
+            if limit:
+                axis.annotate(limit, (cv, score), fontsize=7, color=color)
+    for name, (score, cv) in paper.items():
+        axis.plot(cv, score, "kx")
+        axis.annotate(f"{name} (paper)", (cv, score), fontsize=7)
+    axis.set(xlabel="violations per step", ylabel="score", xscale="log")
     axis.legend(fontsize=8)
     figure.savefig(path, dpi=120)
 
 
 def main(argv: Sequence[str] | None = None) -> None:
-    """Write table, pictures and curves."""
+    """Write tables, pictures and curves."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("root", type=Path)
     parser.add_argument("out", type=Path)
@@ -156,10 +262,15 @@ def main(argv: Sequence[str] | None = None) -> None:
     args.out.mkdir(parents=True, exist_ok=True)
     for path in sorted(args.root.glob("*/seed_*/results.json")):
         keep_run(path.parent, args.out / path.parts[-3] / path.parts[-2])
-    (args.out / "table.md").write_text(table(results))
-    plot_curves(args.root, args.out / "curves.png")
-    plot_frontier(results, args.out / "frontier.png")
-    print(table(results))
+    paper = PAPER.get(args.root.resolve().name, {})
+    (args.out / "table.md").write_text(table(results, paper))
+    (args.out / "claims.md").write_text(claims(results, paper))
+    for name in ("table_1", "table_3"):
+        methods = [method for method in TABLES[name] if method in results]
+        if methods:
+            plot_curves(args.root, methods, args.out / f"{name}.png")
+    plot_frontier(results, paper, args.out / "frontier.png")
+    print(table(results, paper), claims(results, paper), sep="\n")
 
 
 if __name__ == "__main__":

@@ -76,13 +76,51 @@ class TestStatistics:
 
 def test_table():
     run = dict.fromkeys(make_table.COLUMNS.values(), 2.0)
-    text = make_table.table({"cpo": [{**run, "frames": 1000}, {**run, "frames": 900}]})
+    results = {"cpo": [{**run, "frames": 1000}, {**run, "frames": 900}]}
+    text = make_table.table(results, make_table.PAPER["point"])
     assert text.splitlines()[-1].startswith("| cpo | 2 | 900 | 2, IQM 2 (2 to 2) |")
+    assert text.endswith(" 8 / 0.021 |\n")
+    assert make_table.table(results, {}).endswith(" - |\n")
+
+
+def test_claims():
+    """One that holds, one that fails, one that seeds leave open, one without a second seed."""
+
+    def runs(*scores):
+        return [{make_table.SCORE: score, make_table.CV: 0.01} for score in scores]
+
+    results = {
+        "safetac_q12": runs(8.0, 9.0),
+        "cpo": runs(3.0, 4.0),
+        "trc": runs(1.0, 2.0),
+        "safetac_k5": runs(4.0, 14.0),
+        "wcsac": runs(0.0),
+        "unknown": runs(1.0, 1.0),
+    }
+    rows = [
+        [cell.strip() for cell in line.split("|")[1:-1]]
+        for line in make_table.claims(results, make_table.PAPER["point"]).splitlines()[2:]
+    ]
+    verdicts = {claim: verdict for claim, *_, verdict in rows}
+    assert verdicts["SafeTAC scores more than CPO"] == "holds"
+    assert verdicts["TRC scores more than SafeTAC (on Point)"] == "fails"
+    assert verdicts["K = 5 scores more than K = 1"] == "open"
+    assert verdicts["SafeTAC scores more than WCSAC"] == "open"
+    assert verdicts["CPO violates more than SafeTAC"] == "open"  # a difference of nothing
+    assert "q = 1.2 scores more than q = 1" not in verdicts
+    assert rows[0][1:3] == ["+2.4", "+5 (+4 to +6)"]
+
+
+def test_smoothing_keeps_a_line():
+    """Means of what is there: a constant stays one at the ends, and the inside of a line does."""
+    np.testing.assert_allclose(make_table.smoothed(np.full(20, 3.0)), 3.0)
+    np.testing.assert_allclose(make_table.smoothed(np.arange(20.0))[4:-4], np.arange(4, 16))
+    np.testing.assert_allclose(make_table.smoothed(np.ones(2)), 1.0)
 
 
 def test_from_runs_to_pictures(tmp_path):
     """A run that is not finished, and the logs of the cells, are left alone."""
-    for name, finished in (("cpo_limit2.5", True), ("cpo_limit5.5", True), ("trc", False)):
+    for name, finished in (("cpo_limit2.5", True), ("cpo", True), ("trc", False)):
         run_dir = tmp_path / "point" / name / "seed_0"
         logger = CSVLogger("log", log_dir=str(run_dir))
         for frames in (400, 800):
@@ -99,6 +137,6 @@ def test_from_runs_to_pictures(tmp_path):
     text = (tmp_path / "out" / "table.md").read_text()
     assert "cpo_limit2.5" in text
     assert "trc" not in text
-    for name in ("curves.png", "frontier.png"):
+    for name in ("table_1.png", "frontier.png"):
         assert (tmp_path / "out" / name).stat().st_size > 5_000
-    assert (tmp_path / "out" / "cpo_limit5.5" / "seed_0" / "curves.csv").exists()
+    assert (tmp_path / "out" / "cpo" / "seed_0" / "curves.csv").exists()

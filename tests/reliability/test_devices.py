@@ -16,7 +16,7 @@ import utils
 from policy_steps import policy_kl
 from tensordict import TensorDict
 from test_host_sync import HostReads
-from tiny import config
+from tiny import config, launch
 from torch import nn
 from torchrl.data import Bounded
 from torchrl.modules import MLP, ValueOperator
@@ -28,6 +28,7 @@ from torchrl_safe import (
     TsallisLoss,
 )
 from torchrl_safe.objectives.value import with_policy
+from torchrl_safe.record import read_metrics
 
 OBS, ACT = 3, 2
 gpu = [
@@ -46,12 +47,12 @@ def make_blocks(device: str) -> tuple[GMMTanhPolicy, TsallisLoss, CVaRCostLoss]:
     """The same blocks on every device."""
     torch.manual_seed(0)
     net = MLP(OBS, 3 * (1 + 2 * ACT), num_cells=[16])
-    spec = Bounded(-1, 1, (ACT,), dtype=torch.float64)
+    spec = Bounded(-1, 1, (ACT,), dtype=torch.float64, device=device)
     policy = GMMTanhPolicy(net, spec, num_components=3).double().to(device)
     reward_loss = TsallisLoss(
         policy,
         make_critic("state_action_value").to(device),
-        alpha_init=0.1,
+        alpha_init=1.0,  # its logarithm and back are exact: alpha is kept in single precision
         fixed_alpha=True,
         delay_qvalue=False,
     )
@@ -141,7 +142,13 @@ def test_numbers_are_those_of_the_cpu(device):
     expected, actual = learn("cpu"), learn(device)
     for name, value in expected.items():
         assert actual[name].device.type == device
-        torch.testing.assert_close(actual[name].cpu(), value, rtol=1e-8, atol=1e-10, msg=name)
+        torch.testing.assert_close(
+            actual[name].cpu(),
+            value,
+            rtol=1e-8,
+            atol=1e-10,
+            msg=lambda text, name=name: f"{name}: {text}",
+        )
 
 
 def make_critics_update(device: str) -> Callable[[], None]:
@@ -210,6 +217,55 @@ def test_host_waits_for_the_line_search_alone(device):
         candidates = report.backtracks + 1
         waits[iterations] = len([w for w in caught if "synchroniz" in str(w.message)]), candidates
     assert waits[2] == waits[20], waits
+
+
+@pytest.mark.parametrize("device", [GPU])
+def test_cuda_graphs_learn_the_same(device, tmp_path):
+    """A pass of gradient steps as one graph, and a bad number in it reaches nothing."""
+    ends = []
+    for graphs in (False, True):
+        torch.manual_seed(0)
+        cfg = config(tmp_path, f"device={device}", f"optim.cuda_graphs={graphs}")
+        env = utils.make_env(cfg, 4, seed=0)
+        losses = critics.make_losses(cfg, env, utils.make_policy(cfg, env))
+        optim = critics.make_critic_optim(cfg, *losses)
+        fit = critics.CriticFit(cfg, critics.make_buffer(cfg), *losses, optim)
+        data = TensorDict(
+            observation=torch.randn(100, 24),
+            action=torch.rand(100, env.action_spec.shape[-1]) * 2 - 1,
+            **{f"{name}_target": torch.rand(100, 1) for name in ("value", "cost", "std")},
+            batch_size=[100],
+        ).to(device)
+        for _ in range(6):
+            fit._descend(data.clone())
+        assert fit.descent.count() == 0
+        before = [p.detach().clone() for p in optim.param_groups[0]["params"]]
+        bad = data.clone()
+        bad["cost_target"][7] = torch.nan
+        fit._descend(bad)
+        assert fit.descent.count() == 1
+        assert all(map(torch.equal, before, optim.param_groups[0]["params"]))
+        fit._descend(data.clone())
+        assert not any(map(torch.equal, before, optim.param_groups[0]["params"]))
+        ends.append([p.detach() for p in optim.param_groups[0]["params"]])
+    for eager, graph in zip(*ends, strict=True):
+        torch.testing.assert_close(graph, eager, rtol=1e-3, atol=1e-5)
+
+
+@pytest.mark.parametrize("device", [GPU])
+def test_a_run_of_the_example(device, tmp_path):
+    """With CUDA graphs: several updates, a checkpoint, and a resumed run from it."""
+    launch(
+        tmp_path / "run",
+        f"device={device}",
+        "optim.critic_rounds=4",
+        "collector.total_frames=400",
+    )
+    more = ["resume=true", "collector.total_frames=600"]
+    launch(tmp_path / "run", f"device={device}", "optim.critic_rounds=4", *more)
+    losses = read_metrics(tmp_path / "run" / "log")["update/loss_qvalue"][1]
+    assert len(losses) == 6
+    assert torch.as_tensor(losses).isfinite().all()
 
 
 def test_networks_and_replay_of_the_example(tmp_path):

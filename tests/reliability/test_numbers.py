@@ -54,7 +54,7 @@ class Update:
     def fit(self, batch):
         buffer = critics.make_buffer(self.cfg)
         buffer.extend(batch.select(*critics.REPLAYED))
-        return critics.fit_critics(self.cfg, buffer, *self.losses, self.critic_optim)
+        return critics.CriticFit(self.cfg, buffer, *self.losses, self.critic_optim)()
 
     def step(self, batch):
         return self.policy_optim.step(

@@ -13,7 +13,7 @@ import torch
 from collectors import BACKENDS
 from omegaconf import DictConfig, OmegaConf
 
-from torchrl_safe.envs import ROBOTS
+from torchrl_safe.envs import RANDOMIZATIONS, ROBOTS
 
 
 class Rule(NamedTuple):
@@ -124,6 +124,7 @@ RULES: dict[str, Rule] = {
     "env.robot": one_of(*ROBOTS),
     "env.num_envs": integer(1),
     "env.episode_length": integer(1),
+    "env.randomization": optional(one_of(*RANDOMIZATIONS)),
     "task.top_speed": number("(0, inf)"),
     "task.tilt_cost": number("[0, inf)"),
     "gait": stages(),

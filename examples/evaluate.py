@@ -2,9 +2,11 @@
 
     python examples/evaluate.py runs/safetac_point/seed_0
     python examples/evaluate.py runs/safetac_point/seed_0 --episodes 400 --seed 7
+    python examples/evaluate.py runs/jackal --randomization jackal_real
 
 Writes ``evaluation/`` in the run's folder and prints a table. The layouts are others than those of
-training and of the run's own evaluations.
+training and of the run's own evaluations. The robot can be another one, too: of a profile of mass,
+friction, delay and noise (``torchrl_safe.envs.RANDOMIZATIONS``), into ``evaluation_<profile>/``.
 """
 
 from __future__ import annotations
@@ -22,7 +24,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from utils import load_policy, load_run, make_env
 
 from torchrl_safe import CVaRCostLoss, GMMTanhPolicy
-from torchrl_safe.envs import SafeGoalEnv
+from torchrl_safe.envs import RANDOMIZATIONS, SafeGoalEnv
 from torchrl_safe.record import (
     calibrate,
     evaluate,
@@ -82,12 +84,16 @@ def calibration(
     )
 
 
-def main(run_dir: Path, episodes: int, seed: int, film: bool) -> dict[str, float]:
+def main(
+    run_dir: Path, episodes: int, seed: int, film: bool, randomization: str | None = None
+) -> dict[str, float]:
     """Evaluate, draw, and return the numbers."""
     cfg, checkpoint = load_run(run_dir)
     policy = load_policy(run_dir)
-    num_steps, out = cfg.eval.num_steps, run_dir / "evaluation"
-    env = make_env(cfg, episodes, seed, episode_length=num_steps)
+    num_steps = cfg.eval.num_steps
+    out = run_dir / (f"evaluation_{randomization}" if randomization else "evaluation")
+    options = {"episode_length": num_steps, "randomization": RANDOMIZATIONS.get(randomization)}
+    env = make_env(cfg, episodes, seed, **options)
     # Before the episodes: a run that still trains replaces its checkpoint meanwhile.
     cost_loss = load_cost_loss(cfg, checkpoint, env, policy)
     metrics: dict[str, float] = {}
@@ -117,7 +123,7 @@ def main(run_dir: Path, episodes: int, seed: int, film: bool) -> dict[str, float
     (out / "results.json").write_text(json.dumps(metrics, indent=2) + "\n")
     print(format_table(metrics))
     if film:
-        small = make_env(cfg, filmed, seed, episode_length=num_steps)
+        small = make_env(cfg, filmed, seed, **options)
         try:
             record_video(
                 small,
@@ -143,5 +149,6 @@ if __name__ == "__main__":
     parser.add_argument("run_dir", type=Path)
     parser.add_argument("--episodes", type=int, default=100)
     parser.add_argument("--seed", type=int, default=2_000_003, help="of the layouts")
+    parser.add_argument("--randomization", choices=RANDOMIZATIONS, help="of the robot")
     parser.add_argument("--film", action=argparse.BooleanOptionalAction, default=True)
     main(**vars(parser.parse_args()))

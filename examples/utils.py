@@ -38,7 +38,7 @@ from torchrl.record.loggers import get_logger
 from tqdm import tqdm
 
 from torchrl_safe import GMMTanhPolicy
-from torchrl_safe.envs import SafeGoalEnv
+from torchrl_safe.envs import RANDOMIZATIONS, SafeGoalEnv
 from torchrl_safe.record import (
     batch_metrics,
     count_violations,
@@ -130,9 +130,16 @@ def train(
     in_process = cfg.collector.backend == "single"
     if not in_process:
         run.start(policy=policy)  # workers keep no state: a resumed run sees new layouts
+    make_training_env = partial(
+        make_env,
+        cfg,
+        episode_length=cfg.env.episode_length,
+        stagger=True,
+        randomization=RANDOMIZATIONS.get(cfg.env.randomization),
+    )
     collector = make_collector(
         cfg,
-        partial(make_env, cfg, episode_length=cfg.env.episode_length, stagger=True),
+        make_training_env,
         policy,
         seed=cfg.seed + run.frames,
         total_frames=run.frames_left or cfg.collector.frames_per_batch,

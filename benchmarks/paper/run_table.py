@@ -3,6 +3,7 @@
     python benchmarks/paper/run_table.py table_1 --robots point car --seeds 0 1 2
     python benchmarks/paper/run_table.py table_3 --seeds 0 1 2 --set collector.total_frames=1000000
     python benchmarks/paper/run_table.py frontier --seeds 0
+    python benchmarks/paper/run_table.py table_2 --robots jackal
     python benchmarks/paper/run_table.py table_1 --dry-run
 
 A cell is a method, a robot and a seed. Finished cells are skipped; an interrupted one goes on from
@@ -52,6 +53,7 @@ TABLES: dict[str, Sequence[str]] = {
         *("safetac_q14", "safetac_q12", "safetac_q10", "trc", "offpolicy_trc"),
         *("wcsac", "sac_lagrangian", "cpo"),
     ],
+    "table_2": ["safetac_q12", "trc", "wcsac", "cpo"],
     "table_3": [
         *("safetac_q12", "safetac_k3", "safetac_k5", "safetac_q10"),
         *("safetac_lmbda0", "safetac_lagrangian", "safetac_pid"),
@@ -72,17 +74,20 @@ def cells(
     table: str, robots: Sequence[str], seeds: Sequence[int], methods: Sequence[str] | None = None
 ) -> list[Cell]:
     """All cells of a table, seed by seed: a table with few seeds is complete as early as it can."""
-    limits = [f"loss.cost_limit={limit}" for limit in LIMITS] if table == "frontier" else [""]
+    variants: dict[str, tuple[str, ...]] = {"": ()}
+    if table == "frontier":
+        variants = {f"_limit{limit}": (f"loss.cost_limit={limit}",) for limit in LIMITS}
+    elif table == "table_2":
+        variants = {"_randomized": ("env.randomization=jackal_training",)}
     out = []
     for seed in seeds:
         for robot in robots:
             for method in methods or TABLES[table]:
                 script, *overrides = METHODS[method]
-                for limit in limits:
-                    name = f"{method}_limit{limit.partition('=')[2]}" if limit else method
-                    more = [limit] if limit else []
+                for suffix, more in variants.items():
                     options = (*overrides, *more, f"env.robot={robot}", f"seed={seed}")
-                    out.append(Cell(Path(robot, name, f"seed_{seed}"), script, options))
+                    folder = Path(robot, method + suffix, f"seed_{seed}")
+                    out.append(Cell(folder, script, options))
     return out
 
 

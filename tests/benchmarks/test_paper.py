@@ -11,6 +11,8 @@ import make_table
 import numpy as np
 import pytest
 import run_table
+import table_2
+import tiny
 from torchrl.record import CSVLogger
 
 ROOT = Path(__file__).parents[2]
@@ -81,6 +83,23 @@ def test_table():
     assert text.splitlines()[-1].startswith("| cpo | 2 | 900 | 2, IQM 2 (2 to 2) |")
     assert text.endswith(" 8 / 0.021 |\n")
     assert make_table.table(results, {}).endswith(" - |\n")
+
+
+def test_table_2(tmp_path):
+    """Train on randomised Jackals by the cell's own overrides, then drive the held-out one."""
+    (cell,) = run_table.cells("table_2", ["jackal"], [0], ["safetac_q12"])
+    run_dir = tmp_path / cell.folder
+    tiny.launch(run_dir, *cell.overrides, "collector.total_frames=200", "eval.num_steps=100")
+    table_2.main([str(tmp_path / "jackal"), str(tmp_path / "out")])
+    *_, row = (tmp_path / "out" / "table_2.md").read_text().splitlines()
+    name, det, sampled, paper = (text.strip() for text in row.split("|")[1:-1])
+    assert (name, paper) == ("safetac_q12_randomized, seed_0", "21.4 / 20.7 / 0")
+    for cells in (det, sampled):
+        reward, violations, failures = map(float, cells.split("/"))
+        assert abs(reward) < 10
+        assert violations >= failures
+        assert 0 <= failures <= 10
+    assert (run_dir / "evaluation_jackal_real" / "results.json").exists()
 
 
 def test_claims():

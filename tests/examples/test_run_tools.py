@@ -89,6 +89,16 @@ def test_evaluation_is_that_of_the_seed(run_dir):
     assert first["det/return"] != other["det/return"]
 
 
+def test_evaluation_on_another_robot(run_dir):
+    """The same layouts and draws, and a robot of other mass, friction and delay."""
+    nominal = evaluate.main(run_dir, episodes=2, seed=5, film=False)
+    other = evaluate.main(run_dir, episodes=2, seed=5, film=False, randomization="jackal_real")
+    assert nominal["det/return"] != other["det/return"]
+    written = json.loads((run_dir / "evaluation_jackal_real" / "results.json").read_text())
+    assert written == other
+    assert json.loads((run_dir / "evaluation" / "results.json").read_text()) == nominal
+
+
 def test_watch(run_dir, capsys):
     (run_dir / "curves.png").unlink()
     watch.main(run_dir, every=1.0, once=True)

@@ -83,3 +83,13 @@ def test_misuse(env, tmp_path):
         record_trajectories(env, ahead, num_episodes=4)
     with pytest.raises(ValueError, match="at least one"):
         plot_trajectories([], tmp_path / "map.png")
+
+
+def test_boxes(tmp_path):
+    """A Jackal's room has boxes in place of hazards."""
+    env = SafeGoalEnv("jackal", num_envs=1, num_threads=1, seed=0)
+    (only,) = record_trajectories(env, env.rand_action, num_steps=3, num_episodes=1, seed=0)
+    np.testing.assert_array_equal(only["boxes"], env.layout(0)["boxes"])
+    assert only["boxes"].shape == (8, 2)
+    assert only["hazards"].shape == (0, 2)
+    assert plot_trajectories([only], tmp_path / "jackal.png").stat().st_size > 5_000

@@ -8,13 +8,19 @@ from torchrl_safe.envs.adapters import CostToReward, cost_from_info
 from torchrl_safe.envs.checks import check_safe_env
 from torchrl_safe.envs.goal import SafeGoalEnv
 from torchrl_safe.envs.gymnasium import GymGoalEnv, GymGoalVectorEnv, register_envs
-from torchrl_safe.envs.randomization import JACKAL_REAL, JACKAL_TRAINING, Randomization
+from torchrl_safe.envs.randomization import (
+    JACKAL_REAL,
+    JACKAL_TRAINING,
+    RANDOMIZATIONS,
+    Randomization,
+)
 from torchrl_safe.envs.robots import ROBOTS, Robot, get_robot
 from torchrl_safe.envs.tasks import GoalTask, NavigationTask
 
 __all__ = [
     "JACKAL_REAL",
     "JACKAL_TRAINING",
+    "RANDOMIZATIONS",
     "ROBOTS",
     "CostToReward",
     "GoalTask",

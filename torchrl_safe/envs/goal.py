@@ -191,7 +191,7 @@ class SafeGoalEnv(EnvBase):
 
         Returns:
             dict of arrays: ``robot`` [2], ``heading`` [2] (unit vector) and the task's objects:
-            ``goal`` [2], ``goal_distance`` [], ``hazards`` [H, 2]; metres.
+            ``goal`` [2], ``goal_distance`` [], and ``hazards`` [H, 2] or ``boxes`` [B, 2]; metres.
 
         Examples:
             >>> env = SafeGoalEnv(num_envs=2, num_threads=1)

@@ -118,6 +118,9 @@ JACKAL_REAL = Randomization(
 A stand-in for the real robot of SafeTAC's Table II; nobody measured one to choose these numbers.
 """
 
+RANDOMIZATIONS = {"jackal_training": JACKAL_TRAINING, "jackal_real": JACKAL_REAL}
+"""Profiles by name, for configurations."""
+
 
 def drop_readings(
     scan: Array, dropout: Array, streams: RandomStreams, rows: NDArray[np.integer]

@@ -25,13 +25,15 @@ class Trajectory(TypedDict):
     Attributes:
         path: positions of the robot, ``[T + 1, 2]``.
         goals: the goals it was sent to, in order, ``[G, 2]``.
-        hazards: centres of the hazards, ``[H, 2]``.
-        violation: for each position, whether it is inside a hazard, ``[T + 1]``.
+        hazards: centres of the hazards, ``[H, 2]``; none in a task without.
+        boxes: centres of the boxes, ``[B, 2]``; none in a task without.
+        violation: for each position, whether it violates there, ``[T + 1]``.
     """
 
     path: NDArray[np.float64]
     goals: NDArray[np.float64]
     hazards: NDArray[np.float64]
+    boxes: NDArray[np.float64]
     violation: NDArray[np.bool_]
 
 
@@ -48,8 +50,8 @@ def record_trajectories(
 
     Args:
         env (EnvBase): batch size [N], writes ``violation``, and has ``layout(index)`` that returns
-            ``robot`` [2], ``goal`` [2] and ``hazards`` [H, 2], as
-            :class:`~torchrl_safe.envs.SafeGoalEnv` does. Not the collector's, see
+            ``robot`` [2], ``goal`` [2] and, where there are any, ``hazards`` [H, 2] and ``boxes``
+            [B, 2], as :class:`~torchrl_safe.envs.SafeGoalEnv` does. Not the collector's, see
             :func:`~torchrl_safe.record.evaluate`.
         policy (callable): from tensordict to tensordict with the action.
 
@@ -108,7 +110,8 @@ def record_trajectories(
         Trajectory(
             path=np.stack([layout["robot"] for layout in layouts]),
             goals=_changes(np.stack([layout["goal"] for layout in layouts])),
-            hazards=layouts[0]["hazards"],
+            hazards=layouts[0].get("hazards", np.empty((0, 2))),
+            boxes=layouts[0].get("boxes", np.empty((0, 2))),
             violation=np.array(flags),
         )
         for layouts, flags in zip(rows, inside, strict=True)
@@ -121,8 +124,9 @@ def plot_trajectories(
     *,
     hazard_radius: float = 0.2,
     goal_radius: float = 0.3,
+    box_half_size: float = 0.25,
 ) -> Path:
-    """Draws each trajectory over its hazards and goals; steps inside a hazard are red.
+    """Draws each trajectory over its hazards, boxes and goals; steps that violate are red.
 
     Args:
         trajectories (sequence of Trajectory): at least one.
@@ -131,6 +135,7 @@ def plot_trajectories(
     Keyword Args:
         hazard_radius (float): metres. Defaults to 0.2.
         goal_radius (float): metres. Defaults to 0.3.
+        box_half_size (float): half the side of a box, metres. Defaults to 0.25.
 
     Returns:
         Path: the picture.
@@ -150,7 +155,7 @@ def plot_trajectories(
     if not trajectories:
         raise ValueError("trajectories must hold at least one, got none.")
     from matplotlib.figure import Figure
-    from matplotlib.patches import Circle
+    from matplotlib.patches import Circle, Rectangle
 
     columns = math.ceil(math.sqrt(len(trajectories)))
     lines = math.ceil(len(trajectories) / columns)
@@ -161,6 +166,11 @@ def plot_trajectories(
     for axes, trajectory in zip(grid, trajectories, strict=False):
         for centre in trajectory["hazards"]:
             axes.add_patch(Circle(centre, hazard_radius, color="#56B4E9", alpha=0.5, lw=0))
+        for centre in trajectory["boxes"]:
+            side = 2 * box_half_size
+            axes.add_patch(
+                Rectangle(centre - box_half_size, side, side, color="#56B4E9", alpha=0.9, lw=0)
+            )
         for number, centre in enumerate(trajectory["goals"], 1):
             axes.add_patch(Circle(centre, goal_radius, color="#009E73", alpha=0.25, lw=0))
             axes.annotate(str(number), centre, color="#009E73", ha="center", va="center")
@@ -170,7 +180,7 @@ def plot_trajectories(
         inside = trajectory["violation"]
         axes.plot(x[inside], y[inside], ".", color="#D55E00", ms=4)
         reached = len(trajectory["goals"]) - 1
-        axes.set_title(f"goals {reached}, steps in hazards {inside.sum()}", fontsize=9)
+        axes.set_title(f"goals {reached}, violations {inside.sum()}", fontsize=9)
         axes.set_aspect("equal")
         axes.tick_params(labelsize=7)
     path = Path(path)

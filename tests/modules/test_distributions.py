@@ -204,7 +204,8 @@ class TestDraws:
     def test_soft_draws_are_not_the_mixture(self):
         torch.manual_seed(0)
         parameters = separated()
-        draws = TanhGaussianMixture(*parameters).rsample((60_000,)).atanh().numpy()
+        soft = TanhGaussianMixture(*parameters, relaxation="gumbel_softmax")
+        draws = soft.rsample((60_000,)).atanh().numpy()
         statistic, bound = chi_square(draws, parameters, np.linspace(-3, 3, 25))
         assert statistic > 10 * bound
 
@@ -350,6 +351,29 @@ class TestGradient:
 
         inputs = [p.clone().requires_grad_() for p in parameters]
         assert torch.autograd.gradcheck(act, inputs, eps=1e-6, atol=1e-5, rtol=1e-5)
+
+    @pytest.mark.parametrize(
+        ("relaxation", "right"),
+        [("gumbel_softmax", False), ("straight_through", True), ("implicit", True)],
+    )
+    def test_scale_and_entropy(self, relaxation, right):
+        """The entropy of distant components is ``log K + D log scale + ...``: its slope is D.
+
+        Soft draws between them are the less probable the smaller the scale, so that the slope that
+        they give has the wrong sign: going up it shrinks the components.
+        """
+        torch.manual_seed(0)
+        log_scale = torch.tensor(0.05).log().requires_grad_()
+        loc = torch.tensor([-1.0, 1.0])[:, None].expand(20_000, 2, 2)
+        dist = TanhGaussianMixture(
+            torch.zeros(20_000, 2), loc, log_scale.exp().expand_as(loc), relaxation=relaxation
+        )
+        _, log_prob = dist.rsample_and_log_prob()
+        (slope,) = torch.autograd.grad(-log_prob.mean(), log_scale)
+        if right:
+            assert slope.item() == pytest.approx(2.0, abs=0.05)
+        else:
+            assert slope < -50
 
     def test_straight_through_has_the_gradient_of_the_soft_weights(self):
         logits, loc, scale = (p.requires_grad_() for p in random_parameters(5))
@@ -610,7 +634,7 @@ class TestInterface:
             dist.log_prob(torch.full((3, 2), 1.5).double())
 
     def test_bad_action_and_noise(self):
-        dist = TanhGaussianMixture(*random_parameters(4))
+        dist = TanhGaussianMixture(*random_parameters(4), relaxation="gumbel_softmax")
         with pytest.raises(ValueError, match=r"value .*\(4, 1\)"):
             dist.log_prob(torch.zeros(4, 1))
         noise = dist.draw_noise()

@@ -126,7 +126,7 @@ class GMMTanhPolicy(ProbabilisticActor):
         out_keys (list of NestedKey, optional): where the action is written.
             Default: ``["action"]``.
         relaxation (str): how losses differentiate through a draw, see
-            :class:`TanhGaussianMixture`. Default: ``"gumbel_softmax"``.
+            :class:`TanhGaussianMixture`. Default: ``"implicit"``.
         temperature (float): temperature of the soft weights. Default: ``0.5``.
         log_std_bounds (tuple of float): see :class:`GMMParamExtractor`. Default: ``(-4.0, 2.0)``.
         return_log_prob (bool): whether to write ``action_log_prob``. Default: ``True``.
@@ -165,7 +165,7 @@ class GMMTanhPolicy(ProbabilisticActor):
         num_components: int = 3,
         in_keys: NestedKey | list[NestedKey] = "observation",
         out_keys: list[NestedKey] | None = None,
-        relaxation: Relaxation = "gumbel_softmax",
+        relaxation: Relaxation = "implicit",
         temperature: float = 0.5,
         log_std_bounds: tuple[float, float] = (-4.0, 2.0),
         return_log_prob: bool = True,

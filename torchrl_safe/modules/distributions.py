@@ -40,7 +40,9 @@ class TanhGaussianMixture(Distribution):
     * ``"gumbel_softmax"``: eq. (12), :math:`u = \sum_i \omega_i (\mu_i + \epsilon \sigma_i)` with
       soft weights (`arXiv:1611.01144 <https://arxiv.org/abs/1611.01144>`_) and one
       :math:`\epsilon` for all components. Values between the components are *not* draws of the
-      mixture, although the density they are scored with is exact. Low variance, biased.
+      mixture, although the density they are scored with is exact. Low variance, biased, and unfit
+      for an entropy: where components are apart, a smaller scale makes the soft draws between them
+      less probable, so that a gradient that is to raise the entropy shrinks the components.
     * ``"straight_through"``: an exact draw whose gradient is that of the soft weights. Biased.
     * ``"implicit"``: :math:`u_d = F_d^{-1}(\Phi(\epsilon_d) \mid u_{<d})`, the inverse of the
       autoregressive conditional distribution functions (`arXiv:1607.05690
@@ -65,7 +67,7 @@ class TanhGaussianMixture(Distribution):
             Default: ``-1.0``.
         high (float or torch.Tensor): upper action bound, broadcast to ``[*B, D]``.
             Default: ``1.0``.
-        relaxation (str): how ``rsample`` carries a gradient. Default: ``"gumbel_softmax"``.
+        relaxation (str): how ``rsample`` carries a gradient. Default: ``"implicit"``.
         temperature (float): temperature of the soft weights; the implicit gradient has none.
             Default: ``0.5``.
         validate_args (bool, optional): if ``True``, parameter values are checked too. TorchRL turns
@@ -108,7 +110,7 @@ class TanhGaussianMixture(Distribution):
         *,
         low: float | Tensor = -1.0,
         high: float | Tensor = 1.0,
-        relaxation: Relaxation = "gumbel_softmax",
+        relaxation: Relaxation = "implicit",
         temperature: float = 0.5,
         validate_args: bool | None = None,
     ) -> None:

@@ -21,6 +21,8 @@ from pathlib import Path
 
 import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator
+from numpy.typing import NDArray
 from scipy.stats import trim_mean
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
@@ -28,6 +30,8 @@ from keep_run import keep_run
 from run_table import TABLES
 
 from torchrl_safe.record import read_metrics
+
+Array = NDArray[np.float64]
 
 # Score and CV per step of Tables I and III.
 PAPER: dict[str, dict[str, tuple[float, float]]] = {
@@ -69,6 +73,7 @@ PAPER: dict[str, dict[str, tuple[float, float]]] = {
     },
 }
 SCORE, CV = "eval/score", "eval/cv_rate"
+DEFAULT_LIMIT = "5"  # of a cell without one in its name
 CLAIMS = [  # of the paper: the first method has more of the quantity than the second
     ("SafeTAC scores more than CPO", SCORE, "safetac_q12", "cpo"),
     ("SafeTAC scores more than WCSAC", SCORE, "safetac_q12", "wcsac"),
@@ -219,33 +224,43 @@ def plot_frontier(
     paper: Mapping[str, tuple[float, float]],
     path: Path,
 ) -> None:
-    """Score against violations: a line per method through its cost limits, the paper's points."""
-    lines: dict[str, list[tuple[float, float, str]]] = {}
-    figure = Figure(figsize=(8, 6), layout="constrained")
-    axis = figure.subplots()
+    """Score against violations: a line per method through its cost limits, the paper's points.
+
+    Seeds are small dots, their mean a large one with its cost limit beside it.
+    """
+    methods = [*TABLES["table_1"], "safetac_k5"]
+    points: dict[str, list[tuple[str, Array, Array]]] = {}
     for name, runs in results.items():
         method, _, limit = name.partition("_limit")
-        cv, score = (float(np.mean([run[key] for run in runs])) for key in (CV, SCORE))
-        lines.setdefault(method, []).append((cv, score, limit))
-    for number, (method, points) in enumerate(lines.items()):
-        color, style = f"C{number % 10}", "os^"[number // 10]
-        axis.plot(
-            *zip(*[point[:2] for point in sorted(points)], strict=True),
-            f"{style}-",
-            color=color,
-            label=method,
-        )
-        for name, runs in results.items():
-            if name.partition("_limit")[0] == method:
-                dots = [[run[key] for run in runs] for key in (CV, SCORE)]
-                axis.plot(*dots, style, color=color, ms=3, alpha=0.4)
-        for cv, score, limit in points:
-            if limit:
-                axis.annotate(limit, (cv, score), fontsize=7, color=color)
-    for name, (score, cv) in paper.items():
-        axis.plot(cv, score, "kx")
-        axis.annotate(f"{name} (paper)", (cv, score), fontsize=7)
+        if method in methods:
+            violations, scores = (
+                np.array([run[key] for run in runs], float) for key in (CV, SCORE)
+            )
+            points.setdefault(method, []).append((limit or DEFAULT_LIMIT, violations, scores))
+    figure = Figure(figsize=(9, 6), layout="constrained")
+    axis = figure.subplots()
+    for number, (method, cells) in enumerate(points.items()):
+        cells.sort(key=lambda cell: float(cell[0]))
+        means = np.array([(violations.mean(), scores.mean()) for _, violations, scores in cells])
+        (line,) = axis.plot(*means.T, "o-", color=f"C{number}", label=method)
+        for (limit, *seeds), mean in zip(cells, means, strict=True):
+            axis.plot(*seeds, ".", color=line.get_color(), alpha=0.5)
+            axis.annotate(limit, mean, (5, 4), textcoords="offset points", fontsize=7)
+    for name in points:
+        if name in paper:
+            score, violations = paper[name]
+            axis.plot(violations, score, "kx")
+            axis.annotate(
+                f"{name} (paper)",
+                (violations, score),
+                (5, -3),
+                textcoords="offset points",
+                fontsize=7,
+            )
     axis.set(xlabel="violations per step", ylabel="score", xscale="log")
+    axis.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+    axis.xaxis.set_major_formatter("{x:g}")
+    axis.xaxis.set_minor_formatter("")
     axis.legend(fontsize=8)
     figure.savefig(path, dpi=120)
 

@@ -28,6 +28,8 @@ from typing import NamedTuple
 ROOT = Path(__file__).parents[2]
 
 SAFETAC = ("safetac_point", "policy.num_components=1")
+# A limit that falls starves a multiplier, so theirs is the same throughout.
+MULTIPLIER = (*SAFETAC, "loss.entropic_index=1.0", "loss.initial_cost_limit=${loss.cost_limit}")
 METHODS: dict[str, tuple[str, ...]] = {
     "safetac_q14": (*SAFETAC, "loss.entropic_index=1.4"),
     "safetac_q12": (*SAFETAC, "loss.entropic_index=1.2"),
@@ -40,8 +42,8 @@ METHODS: dict[str, tuple[str, ...]] = {
     "safetac_k3": ("safetac_point", "policy.num_components=3", "loss.entropic_index=1.2"),
     "safetac_k5": ("safetac_point", "policy.num_components=5", "loss.entropic_index=1.2"),
     "safetac_lmbda0": (*SAFETAC, "loss.entropic_index=1.0", "loss.lmbda=0"),
-    "safetac_lagrangian": (*SAFETAC, "loss.entropic_index=1.0", "update=lagrangian"),
-    "safetac_pid": (*SAFETAC, "loss.entropic_index=1.0", "update=pid"),
+    "safetac_lagrangian": (*MULTIPLIER, "update=lagrangian"),
+    "safetac_pid": (*MULTIPLIER, "update=pid"),
 }
 """Script and overrides of each method; names are those of the folders in ``runs/paper``."""
 

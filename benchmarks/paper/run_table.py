@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import argparse
 import os
+import shlex
 import shutil
 import signal
 import subprocess
@@ -162,7 +163,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
     if args.dry_run:
         for cell in todo:
-            print(*(command(cell, args.root, extra) or ()))
+            print(shlex.join(command(cell, args.root, extra) or ()))
         return 0
     previous = {number: signal.signal(number, stop) for number in (signal.SIGINT, signal.SIGTERM)}
     try:

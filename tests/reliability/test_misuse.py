@@ -583,11 +583,11 @@ bad(
 )
 bad(
     "TanhGaussianMixture.rsample: noise",
-    lambda: make_mixture().rsample(noise=zeros(5, 2)),
+    lambda: make_mixture().rsample(noise=zeros(5, 3)),
     ValueError,
     "noise",
-    "(5, 2)",
-    "must have shape [*S, 5, 5]",
+    "(5, 3)",
+    "must have shape [*S, 5, 2]",
 )
 bad(
     "export_policy: path",
@@ -1234,6 +1234,7 @@ IMPOSSIBLE = {
     "env.robot": ("unicycle", "'point'"),
     "env.num_envs": (0, "at least 1"),
     "env.episode_length": (0, "at least 1"),
+    "env.randomization": ("rain", "null or one of 'jackal_training'"),
     "task.top_speed": (0.0, "(0, inf)"),
     "task.tilt_cost": (-1.0, "[0, inf)"),
     "gait": ([{"population": 3}], "a list of stages"),
@@ -1290,6 +1291,7 @@ IMPOSSIBLE = {
     "optim.critic_rounds": (0, "at least 1"),
     "optim.critic_frames": (0, "at least 1"),
     "optim.minibatch_size": (0, "at least 1"),
+    "optim.cuda_graphs": (1, "one of True, False"),
     "optim.policy_frames": (0, "at least 1"),
     "optim.curvature_frames": (0, "null or an integer of at least 1"),
     "optim.max_kl": (0.0, "(0, inf)"),

@@ -47,7 +47,8 @@ class Update:
         self.losses = critics.make_losses(self.cfg, env, self.policy)
         self.critic_optim = critics.make_critic_optim(self.cfg, *self.losses)
         self.policy_optim = policy_steps.make_trust_region(self.cfg, self.policy)
-        self.batch = env.rollout(50, self.policy, break_when_any_done=False)
+        with torch.no_grad():  # as collectors do
+            self.batch = env.rollout(50, self.policy, break_when_any_done=False)
         self.batch["collector", "traj_ids"] = torch.arange(4)[:, None].expand(4, 50).clone()
         self.fit(self.batch)  # Adam has moments to lose
 

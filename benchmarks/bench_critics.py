@@ -72,8 +72,8 @@ def plain(cfg: DictConfig, env: SafeGoalEnv, data: TensorDict) -> Callable[[], N
         )
         return nn.Sequential(*hidden, nn.Linear(sizes[-1], 1), *last)
 
-    networks = [network(), network(), network(), network(nn.Softplus())]
-    networks = [each.to(cfg.device) for each in networks]
+    last = [(), (), (), (nn.Softplus(),)]
+    networks = [network(*layers).to(cfg.device) for layers in last]
     params = [p for each in networks for p in each.parameters()]
     optim = torch.optim.Adam(params, lr=cfg.optim.critic_lr, fused=True)
     inputs = torch.cat([data["observation"], data["action"]], -1)

@@ -278,14 +278,15 @@ def main(argv: Sequence[str] | None = None) -> None:
     for path in sorted(args.root.glob("*/seed_*/results.json")):
         keep_run(path.parent, args.out / path.parts[-3] / path.parts[-2])
     paper = PAPER.get(args.root.resolve().name, {})
-    (args.out / "table.md").write_text(table(results, paper))
-    (args.out / "claims.md").write_text(claims(results, paper))
+    texts = {"table": table(results, paper), "claims": claims(results, paper)}
+    for name, text in texts.items():
+        (args.out / f"{name}.md").write_text(text)
     for name in ("table_1", "table_3"):
         methods = [method for method in TABLES[name] if method in results]
         if methods:
             plot_curves(args.root, methods, args.out / f"{name}.png")
     plot_frontier(results, paper, args.out / "frontier.png")
-    print(table(results, paper), claims(results, paper), sep="\n")
+    print(*texts.values(), sep="\n")
 
 
 if __name__ == "__main__":

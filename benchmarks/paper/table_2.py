@@ -58,13 +58,14 @@ def main(argv: Sequence[str] | None = None) -> None:
         parser.error(f"root={args.root} has no <method>{SUFFIX}/seed_<n>/results.json.")
     results = {
         f"{run.parent.name}, {run.name}": evaluate.main(
-            run, NUM_EPISODES, seed=2_000_003, film=False, randomization="jackal_real"
+            run, NUM_EPISODES, seed=evaluate.SEED, film=False, randomization="jackal_real"
         )
         for run in runs
     }
     args.out.mkdir(parents=True, exist_ok=True)
-    (args.out / "table_2.md").write_text(table(results))
-    print(table(results))
+    text = table(results)
+    (args.out / "table_2.md").write_text(text)
+    print(text)
 
 
 if __name__ == "__main__":

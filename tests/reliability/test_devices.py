@@ -7,7 +7,8 @@ without one.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 
 import critics
 import pytest
@@ -43,8 +44,27 @@ def make_critic(key: str, *last: nn.Module) -> ValueOperator:
     return ValueOperator(net, in_keys=["observation", "action"], out_keys=[key]).double()
 
 
+@contextmanager
+def sync_debug_mode(mode: str) -> Iterator[None]:
+    """Waits of the host are errors or warnings; that this is a prototype is said by torch, once."""
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message="Synchronization debug mode")
+        torch.cuda.set_sync_debug_mode(mode)
+    try:
+        yield
+    finally:
+        torch.cuda.set_sync_debug_mode("default")
+
+
 def make_blocks(device: str) -> tuple[GMMTanhPolicy, TsallisLoss, CVaRCostLoss]:
-    """The same blocks on every device."""
+    """The same blocks on every device: a loss draws the weights of its ensemble where they are."""
+    blocks = draw_blocks(device)
+    for block, same in zip(blocks, draw_blocks("cpu"), strict=True):
+        block.load_state_dict(same.state_dict())
+    return blocks
+
+
+def draw_blocks(device: str) -> tuple[GMMTanhPolicy, TsallisLoss, CVaRCostLoss]:
     torch.manual_seed(0)
     net = MLP(OBS, 3 * (1 + 2 * ACT), num_cells=[16])
     spec = Bounded(-1, 1, (ACT,), dtype=torch.float64, device=device)
@@ -187,11 +207,8 @@ def test_critics_read_nothing():
 @pytest.mark.parametrize("device", [GPU])
 def test_host_does_not_wait_for_critics(device):
     update = make_critics_update(device)
-    torch.cuda.set_sync_debug_mode("error")
-    try:
+    with sync_debug_mode("error"):
         update()
-    finally:
-        torch.cuda.set_sync_debug_mode("default")
 
 
 @pytest.mark.parametrize("device", [GPU])
@@ -207,13 +224,9 @@ def test_host_waits_for_the_line_search_alone(device):
         )
         closure = make_closure(policy, reward_loss, cost_loss, states, noise)
         optim.step(closure)
-        torch.cuda.set_sync_debug_mode("warn")
-        try:
-            with warnings.catch_warnings(record=True) as caught:
-                warnings.simplefilter("always")
-                report = optim.step(closure)
-        finally:
-            torch.cuda.set_sync_debug_mode("default")
+        with sync_debug_mode("warn"), warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            report = optim.step(closure)
         candidates = report.backtracks + 1
         waits[iterations] = len([w for w in caught if "synchroniz" in str(w.message)]), candidates
     assert waits[2] == waits[20], waits

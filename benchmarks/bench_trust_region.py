@@ -9,7 +9,7 @@ import pytest
 import torch
 from bench_training import compose
 from critics import make_losses
-from policy_steps import policy_kl
+from policy_steps import moment_kl, policy_statistics
 from safetac_point import policy_closure
 from tensordict import TensorDict
 from torch import Tensor
@@ -52,13 +52,13 @@ def make_closures(
 
 
 def in_terms_of_kl(closure: Callable[[], TensorDict]) -> Callable[[], TensorDict]:
-    """The same closure, for an optimizer that knows nothing of the policy's moments."""
+    """The same closure, for an optimizer that knows nothing of the policy's statistics."""
     with torch.no_grad():
         old = closure()["statistics"]
 
     def kl_closure() -> TensorDict:
         out = closure()
-        out["kl"] = policy_kl(old, out.pop("statistics"))
+        out["kl"] = moment_kl(old, out.pop("statistics"))
         return out
 
     return kl_closure
@@ -68,16 +68,12 @@ def rebuilt_hessian_product(policy: GMMTanhPolicy, states: TensorDict) -> Produc
     """Double backward as most CPO code has it: the KL and its gradient anew for every product."""
     params = list(policy.parameters())
 
-    def moments() -> TensorDict:
-        mean, cov = policy.get_dist(states).moments
-        return TensorDict({"mean": mean, "cov": cov})
-
     def product(vectors: Tensor) -> Tensor:
         rows = []
         for vector in vectors:
-            new = moments()
+            new = TensorDict(policy_statistics(policy.get_dist(states)))
             slope = flatten(
-                gradient("kl", [policy_kl(new.detach(), new)], params, create_graph=True)
+                gradient("kl", [moment_kl(new.detach(), new)], params, create_graph=True)
             )
             rows.append(flatten(gradient("slope", [slope @ vector], params)))
         return torch.stack(rows)
@@ -104,11 +100,11 @@ def bench_natural_gradients(
 
     def make_product() -> Product:
         if curvature == "gauss_newton":
-            return gauss_newton_product(out["statistics"], policy_kl, params)
+            return gauss_newton_product(out["statistics"], moment_kl, params)
         if curvature == "gauss_newton_quarter":
-            return gauss_newton_product(out["curvature_statistics"], policy_kl, params)
+            return gauss_newton_product(out["curvature_statistics"], moment_kl, params)
         if curvature == "double_backward":
-            return hessian_product(policy_kl(old, out["statistics"]), params)
+            return hessian_product(moment_kl(old, out["statistics"]), params)
         return rebuilt_hessian_product(policy, states)
 
     def solve(make_product: Callable[[], Product]) -> Tensor:
@@ -117,7 +113,7 @@ def bench_natural_gradients(
         return conjugate_gradient(lambda v: product(v) + damping * v, rhs, CG_ITERS).solution
 
     solution = benchmark.pedantic(timed(solve), args=(make_product,), rounds=3, warmup_rounds=1)
-    exact = solve(lambda: hessian_product(policy_kl(old, out["statistics"]), params))
+    exact = solve(lambda: hessian_product(moment_kl(old, out["statistics"]), params))
     cosine = torch.cosine_similarity(solution, exact).min().item()
     benchmark.extra_info["smallest cosine to double backward"] = round(cosine, 6)
     assert cosine > (0.9 if curvature == "gauss_newton_quarter" else 0.9999)
@@ -134,7 +130,7 @@ def bench_step(benchmark: Any, device: str, timed: Any, width: int, curvature: s
         max_kl=cfg.optim.max_kl,
         damping=cfg.optim.damping,
         cg_iters=CG_ITERS,
-        statistics_kl=None if curvature == "double_backward" else policy_kl,
+        statistics_kl=None if curvature == "double_backward" else moment_kl,
     )
     weights = [p.detach().clone() for p in policy.parameters()]
 

@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import torch
 from collectors import BACKENDS
 from omegaconf import DictConfig, OmegaConf
+from policy_steps import DISTANCES
 
 from torchrl_safe.envs import RANDOMIZATIONS, ROBOTS
 
@@ -184,6 +185,7 @@ RULES: dict[str, Rule] = {
     "optim.policy_frames": integer(1),
     "optim.curvature_frames": optional(integer(1)),
     "optim.max_kl": number("(0, inf)"),
+    "optim.kl": one_of(*DISTANCES),
     "optim.damping": number("[0, inf)"),
     "optim.cg_iters": integer(1),
     "optim.backtrack_ratio": number("(0, 1)"),

@@ -11,17 +11,40 @@ from omegaconf import DictConfig
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
-from torchrl_safe import GMMTanhPolicy, TrustRegionSafeOptimizer
+from torchrl_safe import GMMTanhPolicy, TanhGaussianMixture, TrustRegionSafeOptimizer
+from torchrl_safe.modules import mixture_moments
 from torchrl_safe.objectives import LagrangeMultiplier, PIDMultiplier, lagrangian
-from torchrl_safe.objectives.functional import moment_matched_kl
+from torchrl_safe.objectives.functional import matched_bound_kl, moment_matched_kl
 
 
-def policy_kl(old: TensorDictBase, new: TensorDictBase) -> Tensor:
-    """The trust region's distance (15), averaged over states."""
-    return moment_matched_kl(old["mean"], old["cov"], new["mean"], new["cov"]).mean()
+def policy_statistics(dist: TanhGaussianMixture) -> dict[str, Tensor]:
+    """What the distances below compare policies by."""
+    return {"logits": dist.logits, "loc": dist.loc, "scale": dist.scale}
 
 
-def make_trust_region(cfg: DictConfig, policy: GMMTanhPolicy) -> TrustRegionSafeOptimizer:
+def moment_kl(old: TensorDictBase, new: TensorDictBase) -> Tensor:
+    """The trust region's distance (15), averaged over states: Gaussians of the same moments."""
+    return moment_matched_kl(
+        *mixture_moments(old["logits"], old["loc"], old["scale"]),
+        *mixture_moments(new["logits"], new["loc"], new["scale"]),
+    ).mean()
+
+
+def matched_kl(old: TensorDictBase, new: TensorDictBase) -> Tensor:
+    """Mean over states of a bound on the KL of the mixtures, which holds every component."""
+    return matched_bound_kl(
+        *(old["logits"], old["loc"], old["scale"]),
+        *(new["logits"], new["loc"], new["scale"]),
+    ).mean()
+
+
+DISTANCES = {"moment_matched": moment_kl, "matched_bound": matched_kl}
+"""Distances of policies by name; for one component they are the same."""
+
+
+def make_trust_region(
+    cfg: DictConfig, policy: GMMTanhPolicy, distance: str = "moment_matched"
+) -> TrustRegionSafeOptimizer:
     """The optimizer of the policy, with the options of the configuration."""
     return TrustRegionSafeOptimizer(
         policy.parameters(),
@@ -31,7 +54,7 @@ def make_trust_region(cfg: DictConfig, policy: GMMTanhPolicy) -> TrustRegionSafe
         backtrack_ratio=cfg.optim.backtrack_ratio,
         max_backtracks=cfg.optim.max_backtracks,
         recovery_ratio=cfg.optim.recovery_ratio,
-        statistics_kl=policy_kl,
+        statistics_kl=DISTANCES[distance],
     )
 
 

@@ -23,12 +23,18 @@ from critics import (
 )
 from descent import Descent
 from omegaconf import DictConfig
-from policy_steps import Multiplier, ascend, cost_limit_at, make_trust_region
+from policy_steps import (
+    Multiplier,
+    ascend,
+    cost_limit_at,
+    make_trust_region,
+    policy_statistics,
+)
 from tensordict import TensorDict, TensorDictBase
 from torchrl._utils import timeit
 from utils import EVAL_SEED, Run, make_env, make_policy, set_up, train
 
-from torchrl_safe import CVaRCostLoss, GMMTanhPolicy, TanhGaussianMixture, TsallisLoss
+from torchrl_safe import CVaRCostLoss, GMMTanhPolicy, TsallisLoss
 
 
 def policy_closure(
@@ -39,18 +45,13 @@ def policy_closure(
     level: torch.Tensor | None = None,
     curvature_frames: int | None = None,
 ) -> Callable[[], TensorDict]:
-    """Objective, constraint and policy moments of (13) as a function of the policy's weights.
+    """Objective, constraint and statistics of (13) as a function of the policy's weights.
 
     ``level`` is the CVaR that the policy of now is known to have; the critics say how a change
     that is kept will move it. Without, the constraint is (8) as written, in the objective's scale.
     The noise of the actions is drawn here, once: the line search then compares policies, not draws.
     Curvature is that of the first ``curvature_frames`` states, all of them by default.
     """
-
-    def moments(dist: TanhGaussianMixture) -> dict[str, torch.Tensor]:
-        mean, cov = dist.moments
-        return {"mean": mean, "cov": cov}
-
     with torch.no_grad():
         dist = policy.get_dist(states)
         noise = dist.draw_noise()
@@ -66,10 +67,11 @@ def policy_closure(
             "constraint": cost_loss.constraint(states, action, reference=reference, level=level)[
                 None
             ],
-            "statistics": moments(dist),
+            "statistics": policy_statistics(dist),
         }
         if curvature_frames is not None:
-            out["curvature_statistics"] = moments(policy.get_dist(states[:curvature_frames]))
+            part = policy.get_dist(states[:curvature_frames])
+            out["curvature_statistics"] = policy_statistics(part)
         return TensorDict(out)
 
     return closure
@@ -89,7 +91,7 @@ def main(cfg: DictConfig) -> None:
     fit_critics = CriticFit(cfg, buffer, reward_loss, cost_loss, critic_optim)
     components = {}
     if cfg["update"] == "trust_region":  # as an attribute, update is a method of the configuration
-        policy_optim = make_trust_region(cfg, policy)
+        policy_optim = make_trust_region(cfg, policy, cfg.optim.kl)
     else:  # (9), the ablation
         policy_optim = torch.optim.Adam(
             policy.parameters(), lr=cfg.lagrangian.policy_lr, fused=True

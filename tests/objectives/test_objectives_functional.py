@@ -7,12 +7,21 @@ import numpy as np
 import pytest
 import torch
 from scipy import stats
-from torch.distributions import MultivariateNormal, kl_divergence
+from torch.distributions import (
+    Categorical,
+    Independent,
+    MixtureSameFamily,
+    MultivariateNormal,
+    Normal,
+    kl_divergence,
+)
 
+from torchrl_safe.modules import mixture_moments
 from torchrl_safe.objectives.functional import (
     cvar_factor,
     discounted_cost_limit,
     gaussian_cvar,
+    matched_bound_kl,
     moment_matched_kl,
     q_logarithm,
     surrogate_change,
@@ -153,6 +162,70 @@ class TestSurrogateChange:
         for gamma in (-0.1, 1.0, math.nan):
             with pytest.raises(ValueError, match=rf"gamma must be in \[0, 1\), got {gamma}"):
                 surrogate_change(x, x, x, x, gamma)
+
+
+class TestMatchedBoundKL:
+    @staticmethod
+    def draw(*batch, components=3, dim=2):
+        shape = (2, *batch, components)
+        logits = torch.randn(shape, dtype=torch.float64)
+        loc, log_scale = torch.randn(2, *shape, dim, dtype=torch.float64)
+        return list(zip(logits, loc, log_scale.exp(), strict=True))
+
+    @pytest.mark.parametrize("dim", [1, 2])
+    @pytest.mark.parametrize("batch", [(), (7,), (4, 5)])
+    def test_is_the_joint_kl(self, batch, dim):
+        """Of component and value, by torch's divergences of their own distributions."""
+        torch.manual_seed(0)
+        old, new = self.draw(*batch, dim=dim)
+        weights = [Categorical(logits=p[0]) for p in (old, new)]
+        parts = [Independent(Normal(*p[1:]), 1) for p in (old, new)]
+        expected = kl_divergence(*weights) + (weights[0].probs * kl_divergence(*parts)).sum(-1)
+        torch.testing.assert_close(matched_bound_kl(*old, *new), expected)
+
+    def test_bounds_the_kl(self):
+        """Which is an integral, here by quadrature."""
+        torch.manual_seed(1)
+        old, new = self.draw(20, dim=1)
+        grid = torch.linspace(-60, 60, 200_001, dtype=torch.float64)[:, None]
+        log_p, log_q = (
+            MixtureSameFamily(Categorical(logits=w), Normal(m[..., 0], s[..., 0])).log_prob(grid)
+            for w, m, s in (old, new)
+        )
+        kl = torch.trapezoid(log_p.exp() * (log_p - log_q), grid[:, 0], dim=0)
+        bound = matched_bound_kl(*old, *new)
+        assert (kl > 0).all()
+        assert (bound >= kl - 1e-9).all()
+
+    def test_one_component_is_the_kl_of_the_moments(self):
+        torch.manual_seed(2)
+        old, new = self.draw(6, components=1)
+        moments = [(m[:, 0], torch.diag_embed(s[:, 0].square())) for _, m, s in (old, new)]
+        expected = moment_matched_kl(*moments[0], *moments[1])
+        torch.testing.assert_close(matched_bound_kl(*old, *new), expected)
+
+    def test_sees_what_moments_do_not(self):
+        """Two components trade places: the same mixture, by a path that leads far away."""
+        logits, loc = torch.zeros(2), torch.tensor([[1.0], [-1.0]])
+        scale = torch.full((2, 1), 0.1)
+        mean, cov = mixture_moments(logits, loc, scale)
+        assert moment_matched_kl(mean, cov, *mixture_moments(logits, -loc, scale)).abs() < 1e-6
+        assert matched_bound_kl(logits, loc, scale, logits, -loc, scale) == pytest.approx(200.0)
+
+    def test_zero_with_zero_gradient_at_equality(self):
+        torch.manual_seed(3)
+        old, _ = self.draw(5)
+        new = [x.clone().requires_grad_() for x in old]
+        kl = matched_bound_kl(*old, *new)
+        torch.testing.assert_close(kl, torch.zeros_like(kl))
+        for grad in torch.autograd.grad(kl.sum(), new):
+            torch.testing.assert_close(grad, torch.zeros_like(grad))
+
+    def test_gradient(self):
+        torch.manual_seed(4)
+        old, new = self.draw(2)
+        new = [x.requires_grad_() for x in new]
+        assert torch.autograd.gradcheck(lambda *p: matched_bound_kl(*old, *p), new)
 
 
 class TestMomentMatchedKL:

@@ -14,7 +14,7 @@ import critics
 import pytest
 import torch
 import utils
-from policy_steps import policy_kl
+from policy_steps import DISTANCES, policy_statistics
 from tensordict import TensorDict
 from test_host_sync import HostReads
 from tiny import config, launch
@@ -120,17 +120,16 @@ def make_closure(policy, reward_loss, cost_loss, states, noise):
     def closure() -> TensorDict:
         dist = policy.get_dist(states)
         action, log_prob = dist.rsample_and_log_prob(noise=noise)
-        mean, cov = dist.moments
         return TensorDict(
             objective=reward_loss.objective(states, action, log_prob).mean(),
             constraint=cost_loss.constraint(states, action)[None],
-            statistics=TensorDict(mean=mean, cov=cov),
+            statistics=TensorDict(policy_statistics(dist)),
         )
 
     return closure
 
 
-def learn(device: str) -> dict[str, torch.Tensor]:
+def learn(device: str, distance: str) -> dict[str, torch.Tensor]:
     """What every block gives on a device."""
     policy, reward_loss, cost_loss = make_blocks(device)
     data = make_data().to(device)
@@ -151,15 +150,18 @@ def learn(device: str) -> dict[str, torch.Tensor]:
     ):
         out |= {f"{name} {i}": p.grad for i, p in enumerate(params.parameters())}
     states = data.select("observation")
-    optim = TrustRegionSafeOptimizer(policy.parameters(), max_kl=0.01, statistics_kl=policy_kl)
+    optim = TrustRegionSafeOptimizer(
+        policy.parameters(), max_kl=0.01, statistics_kl=DISTANCES[distance]
+    )
     report = optim.step(make_closure(policy, reward_loss, cost_loss, states, noise))
     assert report.accepted, report
     return out | {f"weight {i}": p for i, p in enumerate(policy.parameters())}
 
 
 @pytest.mark.parametrize("device", [GPU])
-def test_numbers_are_those_of_the_cpu(device):
-    expected, actual = learn("cpu"), learn(device)
+@pytest.mark.parametrize("distance", DISTANCES)
+def test_numbers_are_those_of_the_cpu(device, distance):
+    expected, actual = learn("cpu", distance), learn(device, distance)
     for name, value in expected.items():
         assert actual[name].device.type == device
         torch.testing.assert_close(
@@ -220,7 +222,10 @@ def test_host_waits_for_the_line_search_alone(device):
         states = make_data().to(device).select("observation")
         noise = policy.get_dist(states).draw_noise()
         optim = TrustRegionSafeOptimizer(
-            policy.parameters(), max_kl=1e-4, cg_iters=iterations, statistics_kl=policy_kl
+            policy.parameters(),
+            max_kl=1e-4,
+            cg_iters=iterations,
+            statistics_kl=DISTANCES["moment_matched"],
         )
         closure = make_closure(policy, reward_loss, cost_loss, states, noise)
         optim.step(closure)

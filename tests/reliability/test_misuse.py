@@ -237,6 +237,20 @@ for name, moments in {
         str(tuple(moments[("old_mean", "old_cov", "new_mean", "new_cov").index(name)].shape)),
         "must have shape (2",
     )
+MIXTURE = {
+    f"{age}_{name}": torch.ones(shape)
+    for age in ("old", "new")
+    for name, shape in (("logits", (5, 3)), ("loc", (5, 3, 2)), ("scale", (5, 3, 2)))
+}
+for name in (name for name in MIXTURE if name != "old_loc"):
+    bad(
+        f"matched_bound_kl: {name}",
+        partial(F.matched_bound_kl, **{**MIXTURE, name: zeros(5, 1)}),
+        ValueError,
+        name,
+        "(5, 1)",
+        "must have shape (5, 3",
+    )
 bad(
     "lagrangian: shapes",
     lambda: lagrangian(zeros(), zeros(2), zeros(3)),

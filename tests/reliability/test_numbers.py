@@ -46,7 +46,7 @@ class Update:
         self.policy = utils.make_policy(self.cfg, env)
         self.losses = critics.make_losses(self.cfg, env, self.policy)
         self.critic_optim = critics.make_critic_optim(self.cfg, *self.losses)
-        self.policy_optim = policy_steps.make_trust_region(self.cfg, self.policy)
+        self.policy_optim = policy_steps.make_trust_region(self.cfg, self.policy, "matched_bound")
         with torch.no_grad():  # as collectors do
             self.batch = env.rollout(50, self.policy, break_when_any_done=False)
         self.batch["collector", "traj_ids"] = torch.arange(4)[:, None].expand(4, 50).clone()
@@ -156,14 +156,14 @@ def test_curvature_products_and_policy_gradients(update, bad, where):
     state = update.state()
 
     def spoiled(old, new):
-        kl = policy_steps.policy_kl(old, new)
-        if new["mean"].requires_grad and where == "curvature":
-            new["mean"].register_hook(lambda grad: grad * bad)
+        kl = policy_steps.matched_kl(old, new)
+        if new["loc"].requires_grad and where == "curvature":
+            new["loc"].register_hook(lambda grad: grad * bad)
         return kl
 
     param = next(update.policy.parameters())
     hook = param.register_hook(lambda grad: grad * bad if where == "gradient" else grad)
-    optim = policy_steps.make_trust_region(update.cfg, update.policy)
+    optim = policy_steps.make_trust_region(update.cfg, update.policy, "matched_bound")
     optim.statistics_kl = spoiled
     good, update.policy_optim = update.policy_optim, optim
     try:

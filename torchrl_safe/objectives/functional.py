@@ -17,6 +17,7 @@ __all__ = [
     "cvar_factor",
     "discounted_cost_limit",
     "gaussian_cvar",
+    "matched_bound_kl",
     "moment_matched_kl",
     "q_logarithm",
     "surrogate_change",
@@ -219,6 +220,70 @@ def surrogate_change(
     weight = (log_pi - log_mu).clamp(max=0).exp()
     centred = advantage - (weight * advantage).mean() / weight.mean()
     return (torch.expm1(log_prob - log_pi) * weight * centred).mean() / (1 - gamma)
+
+
+def matched_bound_kl(
+    old_logits: Tensor,
+    old_loc: Tensor,
+    old_scale: Tensor,
+    new_logits: Tensor,
+    new_loc: Tensor,
+    new_scale: Tensor,
+) -> Tensor:
+    r"""Upper bound of the KL divergence between two mixtures of diagonal Gaussians.
+
+    .. math::
+
+        \text{KL}(p \,\|\, p') \le \sum_k w_k \Big(\log \frac{w_k}{w'_k}
+        + \text{KL}(\mathcal N_k \,\|\, \mathcal N'_k)\Big),
+
+    the KL of component and value together (the matched bound of Hershey and Olsen 2007). For
+    single Gaussians it is exact. A trust region that only sees the moments
+    (:func:`moment_matched_kl`) lets components move at will as long as their moments stay; this one
+    holds each of them. Squashing changes neither side: the KL is that of the actions.
+
+    Args:
+        old_logits (Tensor): unnormalized log-weights, ``[*B, K]``.
+        old_loc (Tensor): means, ``[*B, K, D]``.
+        old_scale (Tensor): standard deviations, ``[*B, K, D]``.
+        new_logits (Tensor): ``[*B, K]``.
+        new_loc (Tensor): ``[*B, K, D]``.
+        new_scale (Tensor): ``[*B, K, D]``.
+
+    Returns:
+        The bound on ``KL(old || new)`` in nats, ``[*B]``.
+
+    Raises:
+        ValueError: if shapes disagree.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_safe.objectives.functional import matched_bound_kl
+        >>> logits, loc, scale = torch.zeros(2), torch.tensor([[1.0], [-1.0]]), torch.ones(2, 1)
+        >>> matched_bound_kl(logits, loc, scale, logits, loc + 1.0, scale)
+        tensor(0.5000)
+        >>> matched_bound_kl(logits, loc, scale, logits, -loc, scale)  # moments are the same
+        tensor(2.)
+    """
+    shape = tuple(old_loc.shape)
+    for name, tensor, expected in (
+        ("old_logits", old_logits, shape[:-1]),
+        ("old_scale", old_scale, shape),
+        ("new_logits", new_logits, shape[:-1]),
+        ("new_loc", new_loc, shape),
+        ("new_scale", new_scale, shape),
+    ):
+        if tensor.shape != expected:
+            raise ValueError(
+                f"{name} must have shape {expected}, as old_loc's {shape} says, got "
+                f"{tuple(tensor.shape)}."
+            )
+    ratio = old_scale / new_scale
+    shift = (new_loc - old_loc) / new_scale
+    component = 0.5 * (ratio.square() - 1 + shift.square()).sum(-1) - ratio.log().sum(-1)
+    log_weight = old_logits.log_softmax(-1)
+    gap = log_weight - new_logits.log_softmax(-1)
+    return (log_weight.exp() * (gap + component)).sum(-1)
 
 
 def moment_matched_kl(

@@ -42,6 +42,10 @@ METHODS: dict[str, tuple[str, ...]] = {
     "cpo": ("cpo",),
     "safetac_k3": ("safetac_point", "policy.num_components=3", "loss.entropic_index=1.2"),
     "safetac_k5": ("safetac_point", "policy.num_components=5", "loss.entropic_index=1.2"),
+    "safetac_k5_matched": (
+        *("safetac_point", "policy.num_components=5", "loss.entropic_index=1.2"),
+        "optim.kl=matched_bound",
+    ),
     "safetac_lmbda0": (*SAFETAC, "loss.entropic_index=1.0", "loss.lmbda=0"),
     "safetac_lagrangian": (*MULTIPLIER, "update=lagrangian"),
     "safetac_pid": (*MULTIPLIER, "update=pid"),
@@ -58,7 +62,7 @@ TABLES: dict[str, Sequence[str]] = {
     ],
     "table_2": ["safetac_q12", "trc", "wcsac", "cpo"],
     "table_3": [
-        *("safetac_q12", "safetac_k3", "safetac_k5", "safetac_q10"),
+        *("safetac_q12", "safetac_k3", "safetac_k5", "safetac_k5_matched", "safetac_q10"),
         *("safetac_lmbda0", "safetac_lagrangian", "safetac_pid"),
     ],
     "frontier": ["safetac_q12", "trc", "wcsac", "sac_lagrangian", "cpo"],

@@ -1309,6 +1309,7 @@ IMPOSSIBLE = {
     "optim.policy_frames": (0, "at least 1"),
     "optim.curvature_frames": (0, "null or an integer of at least 1"),
     "optim.max_kl": (0.0, "(0, inf)"),
+    "optim.kl": ("moments", "'moment_matched', 'matched_bound'"),
     "optim.damping": (-0.1, "[0, inf)"),
     "optim.cg_iters": (0, "at least 1"),
     "optim.backtrack_ratio": (1.0, "(0, 1)"),

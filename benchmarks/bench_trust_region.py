@@ -9,7 +9,7 @@ import pytest
 import torch
 from bench_training import compose
 from critics import make_losses
-from policy_steps import moment_kl, policy_statistics
+from policy_steps import moment_kl
 from safetac_point import policy_closure
 from tensordict import TensorDict
 from torch import Tensor
@@ -52,7 +52,7 @@ def make_closures(
 
 
 def in_terms_of_kl(closure: Callable[[], TensorDict]) -> Callable[[], TensorDict]:
-    """The same closure, for an optimizer that knows nothing of the policy's statistics."""
+    """The same closure, for an optimizer that knows nothing of the policy's moments."""
     with torch.no_grad():
         old = closure()["statistics"]
 
@@ -68,10 +68,14 @@ def rebuilt_hessian_product(policy: GMMTanhPolicy, states: TensorDict) -> Produc
     """Double backward as most CPO code has it: the KL and its gradient anew for every product."""
     params = list(policy.parameters())
 
+    def moments() -> TensorDict:
+        mean, cov = policy.get_dist(states).moments
+        return TensorDict({"mean": mean, "cov": cov})
+
     def product(vectors: Tensor) -> Tensor:
         rows = []
         for vector in vectors:
-            new = TensorDict(policy_statistics(policy.get_dist(states)))
+            new = moments()
             slope = flatten(
                 gradient("kl", [moment_kl(new.detach(), new)], params, create_graph=True)
             )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from descent import Descent
@@ -12,34 +12,46 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from torchrl_safe import GMMTanhPolicy, TanhGaussianMixture, TrustRegionSafeOptimizer
-from torchrl_safe.modules import mixture_moments
 from torchrl_safe.objectives import LagrangeMultiplier, PIDMultiplier, lagrangian
 from torchrl_safe.objectives.functional import matched_bound_kl, moment_matched_kl
 
 
-def policy_statistics(dist: TanhGaussianMixture) -> dict[str, Tensor]:
-    """What the distances below compare policies by."""
-    return {"logits": dist.logits, "loc": dist.loc, "scale": dist.scale}
+def moments(dist: TanhGaussianMixture) -> dict[str, Tensor]:
+    """What :func:`moment_kl` compares."""
+    mean, cov = dist.moments
+    return {"mean": mean, "cov": cov}
 
 
 def moment_kl(old: TensorDictBase, new: TensorDictBase) -> Tensor:
-    """The trust region's distance (15), averaged over states: Gaussians of the same moments."""
-    return moment_matched_kl(
-        *mixture_moments(old["logits"], old["loc"], old["scale"]),
-        *mixture_moments(new["logits"], new["loc"], new["scale"]),
-    ).mean()
+    """The trust region's distance (15), averaged over states."""
+    return moment_matched_kl(old["mean"], old["cov"], new["mean"], new["cov"]).mean()
 
 
-def matched_kl(old: TensorDictBase, new: TensorDictBase) -> Tensor:
-    """Mean over states of a bound on the KL of the mixtures, which holds every component."""
+def parameters(dist: TanhGaussianMixture) -> dict[str, Tensor]:
+    """What :func:`bound_kl` compares."""
+    return {"logits": dist.logits, "loc": dist.loc, "scale": dist.scale}
+
+
+def bound_kl(old: TensorDictBase, new: TensorDictBase) -> Tensor:
+    """A bound on the KL of mixtures that holds every component, averaged over states."""
     return matched_bound_kl(
         *(old["logits"], old["loc"], old["scale"]),
         *(new["logits"], new["loc"], new["scale"]),
     ).mean()
 
 
-DISTANCES = {"moment_matched": moment_kl, "matched_bound": matched_kl}
-"""Distances of policies by name; for one component they are the same."""
+class Distance(NamedTuple):
+    """A distance of policies, and the statistics of a policy that it compares."""
+
+    statistics: Callable[[TanhGaussianMixture], dict[str, Tensor]]
+    kl: Callable[[TensorDictBase, TensorDictBase], Tensor]
+
+
+DISTANCES = {
+    "moment_matched": Distance(moments, moment_kl),
+    "matched_bound": Distance(parameters, bound_kl),
+}
+"""For one component they are the same."""
 
 
 def make_trust_region(
@@ -54,7 +66,7 @@ def make_trust_region(
         backtrack_ratio=cfg.optim.backtrack_ratio,
         max_backtracks=cfg.optim.max_backtracks,
         recovery_ratio=cfg.optim.recovery_ratio,
-        statistics_kl=DISTANCES[distance],
+        statistics_kl=DISTANCES[distance].kl,
     )
 
 

@@ -24,11 +24,11 @@ from critics import (
 from descent import Descent
 from omegaconf import DictConfig
 from policy_steps import (
+    DISTANCES,
     Multiplier,
     ascend,
     cost_limit_at,
     make_trust_region,
-    policy_statistics,
 )
 from tensordict import TensorDict, TensorDictBase
 from torchrl._utils import timeit
@@ -44,6 +44,7 @@ def policy_closure(
     states: TensorDictBase,
     level: torch.Tensor | None = None,
     curvature_frames: int | None = None,
+    distance: str = "moment_matched",
 ) -> Callable[[], TensorDict]:
     """Objective, constraint and statistics of (13) as a function of the policy's weights.
 
@@ -52,6 +53,7 @@ def policy_closure(
     The noise of the actions is drawn here, once: the line search then compares policies, not draws.
     Curvature is that of the first ``curvature_frames`` states, all of them by default.
     """
+    statistics = DISTANCES[distance].statistics
     with torch.no_grad():
         dist = policy.get_dist(states)
         noise = dist.draw_noise()
@@ -67,11 +69,10 @@ def policy_closure(
             "constraint": cost_loss.constraint(states, action, reference=reference, level=level)[
                 None
             ],
-            "statistics": policy_statistics(dist),
+            "statistics": statistics(dist),
         }
         if curvature_frames is not None:
-            part = policy.get_dist(states[:curvature_frames])
-            out["curvature_statistics"] = policy_statistics(part)
+            out["curvature_statistics"] = statistics(policy.get_dist(states[:curvature_frames]))
         return TensorDict(out)
 
     return closure
@@ -123,7 +124,13 @@ def main(cfg: DictConfig) -> None:
                 order = torch.randperm(len(visited), device=visited.device)
                 states = visited[order[: cfg.optim.policy_frames]]
                 closure = policy_closure(
-                    policy, reward_loss, cost_loss, states, level, cfg.optim.curvature_frames
+                    policy,
+                    reward_loss,
+                    cost_loss,
+                    states,
+                    level,
+                    cfg.optim.curvature_frames,
+                    cfg.optim.kl,
                 )
                 metrics |= policy_optim.step(closure).to_dict()
             else:

@@ -8,7 +8,6 @@ import torch
 from critics import minibatches
 from descent import Descent
 from omegaconf import DictConfig
-from policy_steps import policy_statistics
 from tensordict import TensorDict, TensorDictBase
 from torch import nn
 from torchrl.envs import EnvBase
@@ -65,16 +64,17 @@ def surrogate_closure(
     data: TensorDictBase,
     moments: CostMoments,
 ) -> Callable[[], TensorDict]:
-    """Objective, constraint and statistics as a function of the policy's weights."""
+    """Objective, constraint and policy moments as a function of the policy's weights."""
 
     def closure() -> TensorDict:
         dist = policy.get_dist(data)
         log_prob = dist.log_prob(data["action"])
+        mean, cov = dist.moments
         return TensorDict(
             {
                 "objective": reward_loss.objective(data, log_prob),
                 "constraint": cost_loss.constraint(data, log_prob, moments)[None],
-                "statistics": policy_statistics(dist),
+                "statistics": {"mean": mean, "cov": cov},
             }
         )
 

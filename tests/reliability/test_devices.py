@@ -14,7 +14,7 @@ import critics
 import pytest
 import torch
 import utils
-from policy_steps import DISTANCES, policy_statistics
+from policy_steps import DISTANCES
 from tensordict import TensorDict
 from test_host_sync import HostReads
 from tiny import config, launch
@@ -114,7 +114,7 @@ def make_data(batch: tuple[int, int] = (6, 7)) -> TensorDict:
     return with_policy(data, make_blocks("cpu")[0])
 
 
-def make_closure(policy, reward_loss, cost_loss, states, noise):
+def make_closure(policy, reward_loss, cost_loss, states, noise, distance="moment_matched"):
     """Noise is given, since generators of two devices differ."""
 
     def closure() -> TensorDict:
@@ -123,7 +123,7 @@ def make_closure(policy, reward_loss, cost_loss, states, noise):
         return TensorDict(
             objective=reward_loss.objective(states, action, log_prob).mean(),
             constraint=cost_loss.constraint(states, action)[None],
-            statistics=TensorDict(policy_statistics(dist)),
+            statistics=TensorDict(DISTANCES[distance].statistics(dist)),
         )
 
     return closure
@@ -151,9 +151,9 @@ def learn(device: str, distance: str) -> dict[str, torch.Tensor]:
         out |= {f"{name} {i}": p.grad for i, p in enumerate(params.parameters())}
     states = data.select("observation")
     optim = TrustRegionSafeOptimizer(
-        policy.parameters(), max_kl=0.01, statistics_kl=DISTANCES[distance]
+        policy.parameters(), max_kl=0.01, statistics_kl=DISTANCES[distance].kl
     )
-    report = optim.step(make_closure(policy, reward_loss, cost_loss, states, noise))
+    report = optim.step(make_closure(policy, reward_loss, cost_loss, states, noise, distance))
     assert report.accepted, report
     return out | {f"weight {i}": p for i, p in enumerate(policy.parameters())}
 
@@ -225,7 +225,7 @@ def test_host_waits_for_the_line_search_alone(device):
             policy.parameters(),
             max_kl=1e-4,
             cg_iters=iterations,
-            statistics_kl=DISTANCES["moment_matched"],
+            statistics_kl=DISTANCES["moment_matched"].kl,
         )
         closure = make_closure(policy, reward_loss, cost_loss, states, noise)
         optim.step(closure)

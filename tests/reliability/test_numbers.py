@@ -64,7 +64,7 @@ class Update:
                 *self.losses,
                 batch.select("observation").flatten(),
                 self.losses[1].on_policy_cvar(batch),
-                None,
+                distance="matched_bound",
             )
         )
 
@@ -156,7 +156,7 @@ def test_curvature_products_and_policy_gradients(update, bad, where):
     state = update.state()
 
     def spoiled(old, new):
-        kl = policy_steps.matched_kl(old, new)
+        kl = policy_steps.bound_kl(old, new)
         if new["loc"].requires_grad and where == "curvature":
             new["loc"].register_hook(lambda grad: grad * bad)
         return kl

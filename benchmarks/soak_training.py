@@ -10,8 +10,8 @@ The processes may have run for long already; their workers count with them. It r
 Ctrl-C, or the end of a training, ends the watch early and judges what there is.
 
 A replay buffer is allocated with the first batch, but its pages become resident as they are first
-written: memory is compared from the moment on when the buffer has been filled once. Throughput is
-the log's, of the updates: collecting without them, before ``collector.init_frames``, is left out.
+written; the first evaluation opens the files of its metrics. Memory and files are compared from the
+moment on when the buffer has been filled once and an evaluation is over. Throughput is the log's, of the updates: collecting without them, before ``collector.init_frames``, is left out.
 """
 
 from __future__ import annotations
@@ -124,7 +124,7 @@ def tenths(values: Iterable[float]) -> tuple[float, float]:
     return float(np.median(array[:part])), float(np.median(array[-part:]))
 
 
-def judge(samples: Sequence[Sample], speed: np.ndarray, *, full_at: int) -> list[Row]:
+def judge(samples: Sequence[Sample], speed: np.ndarray, *, settled_at: int) -> list[Row]:
     """The last tenth of a training beside the first.
 
     Args:
@@ -132,19 +132,20 @@ def judge(samples: Sequence[Sample], speed: np.ndarray, *, full_at: int) -> list
         speed (np.ndarray): frames per second of its updates, [M].
 
     Keyword Args:
-        full_at (int): frames from which on the replay buffer's memory is resident.
+        settled_at (int): frames from which on the replay buffer's memory is resident and all files
+            of the log are open.
 
     Returns:
-        list of Row: memory and open files from ``full_at`` on, throughput, and the processor's time
+        list of Row: memory and open files from ``settled_at`` on, throughput, and the processor's time
         per frame, which tells a training that slowed down from a machine that had other work.
 
     Raises:
-        ValueError: if there are fewer than ten samples after ``full_at``, or ten updates.
+        ValueError: if there are fewer than ten samples after ``settled_at``, or ten updates.
     """
-    settled = [sample for sample in samples if sample.frames >= full_at]
+    settled = [sample for sample in samples if sample.frames >= settled_at]
     if min(len(settled), len(speed)) < 10:
         raise ValueError(
-            f"a verdict needs 10 samples from {full_at} frames on and 10 updates, got "
+            f"a verdict needs 10 samples from {settled_at} frames on and 10 updates, got "
             f"{len(settled)} of {len(samples)} samples and {len(speed)} updates: watch longer."
         )
 
@@ -216,9 +217,10 @@ def main() -> None:
         cfg = OmegaConf.load(run_dir / "config.yaml")
         speed = logged_speed(run_dir, max(begun[run_dir], cfg.collector.init_frames))
         full_at = cfg.get("replay_buffer", {}).get("size", cfg.collector.frames_per_batch)
+        settled_at = max(full_at, cfg.eval.interval + cfg.collector.frames_per_batch)
         print(f"{run_dir}: {len(samples)} samples, {len(speed)} updates")
         try:
-            rows = judge(samples, speed, full_at=full_at)
+            rows = judge(samples, speed, settled_at=settled_at)
         except ValueError as error:
             failed = True
             print(f"  no verdict: {error}")

@@ -315,6 +315,9 @@ class Run:
         """Write metrics at the current frame."""
         if self.logger is not None:
             self.logger.log_metrics(dict(metrics), step=self.frames)
+            if self.cfg.logger.backend == "csv":
+                # TorchRL's keeps all it ever wrote: megabytes per hour that nobody reads.
+                self.logger.experiment.scalars.clear()
 
     def save(self) -> None:
         """Write a checkpoint; a crash while writing leaves the last one whole.

@@ -31,7 +31,7 @@ SPEED = 1000 + 50 * np.sin(np.arange(300))
 
 
 def verdicts(samples, speed=SPEED):
-    rows = soak_training.judge(samples, speed, full_at=FULL)
+    rows = soak_training.judge(samples, speed, settled_at=FULL)
     return {row.quantity: row for row in rows}
 
 

@@ -102,6 +102,20 @@ class TestRun:
         ):
             assert len(curves[name][0])
 
+    def test_what_is_logged_is_not_kept(self, tmp_path, monkeypatch):
+        """TorchRL's csv logger remembers every value of a run: memory grew with its length."""
+        runs = []
+
+        class Run(utils.Run):
+            def __init__(self, *args, **kwargs):
+                super().__init__(*args, **kwargs)
+                runs.append(self)
+
+        monkeypatch.setattr(safetac_point, "Run", Run)
+        launch(tmp_path / "run", "collector.total_frames=800")
+        assert len(record.read_metrics(tmp_path / "run" / "log")["train/entropy"][0]) == 2
+        assert not runs[0].logger.experiment.scalars
+
     def test_same_seed_same_metrics(self, finished, tmp_path, capsys):
         again = tmp_path / "again"
         launch(again, "collector.total_frames=1600")

@@ -11,7 +11,8 @@ Ctrl-C, or the end of a training, ends the watch early and judges what there is.
 
 A replay buffer is allocated with the first batch, but its pages become resident as they are first
 written; the first evaluation opens the files of its metrics. Memory and files are compared from the
-moment on when the buffer has been filled once and an evaluation is over. Throughput is the log's, of the updates: collecting without them, before ``collector.init_frames``, is left out.
+moment on when the buffer has been filled once and an evaluation is over. Throughput is the log's,
+of the updates: collecting without them, before ``collector.init_frames``, is left out.
 """
 
 from __future__ import annotations
@@ -136,8 +137,8 @@ def judge(samples: Sequence[Sample], speed: np.ndarray, *, settled_at: int) -> l
             of the log are open.
 
     Returns:
-        list of Row: memory and open files from ``settled_at`` on, throughput, and the processor's time
-        per frame, which tells a training that slowed down from a machine that had other work.
+        list of Row: memory and open files from ``settled_at`` on, throughput, and the processor's
+        time per frame, which tells a training that slowed down from a machine that had other work.
 
     Raises:
         ValueError: if there are fewer than ten samples after ``settled_at``, or ten updates.

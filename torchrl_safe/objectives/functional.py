@@ -266,18 +266,14 @@ def matched_bound_kl(
         tensor(2.)
     """
     shape = tuple(old_loc.shape)
-    for name, tensor, expected in (
+    _check_shapes(
         ("old_logits", old_logits, shape[:-1]),
         ("old_scale", old_scale, shape),
         ("new_logits", new_logits, shape[:-1]),
         ("new_loc", new_loc, shape),
         ("new_scale", new_scale, shape),
-    ):
-        if tensor.shape != expected:
-            raise ValueError(
-                f"{name} must have shape {expected}, as old_loc's {shape} says, got "
-                f"{tuple(tensor.shape)}."
-            )
+        because=f"old_loc's {shape}",
+    )
     ratio = old_scale / new_scale
     shift = (new_loc - old_loc) / new_scale
     component = 0.5 * (ratio.square() - 1 + shift.square()).sum(-1) - ratio.log().sum(-1)
@@ -315,16 +311,12 @@ def moment_matched_kl(
     """
     mean_shape = tuple(old_mean.shape)
     cov_shape = (*mean_shape, *mean_shape[-1:])
-    for name, tensor, shape in (
+    _check_shapes(
         ("old_cov", old_cov, cov_shape),
         ("new_mean", new_mean, mean_shape),
         ("new_cov", new_cov, cov_shape),
-    ):
-        if tensor.shape != shape:
-            raise ValueError(
-                f"{name} must have shape {shape}, as old_mean's {mean_shape} says, got "
-                f"{tuple(tensor.shape)}."
-            )
+        because=f"old_mean's {mean_shape}",
+    )
     new_factor, old_factor = _cholesky(new_cov), _cholesky(old_cov)
     dim = range(old_mean.shape[-1])
     zero = torch.zeros_like(old_mean[..., 0])
@@ -333,6 +325,14 @@ def moment_matched_kl(
     squares = [x.square() for b in (*columns, shift) for x in _solve_lower(new_factor, b)]
     half_log_dets = [(new_factor[i][i] / old_factor[i][i]).log() for i in dim]
     return torch.stack(squares).sum(0).sub(len(dim)).mul(0.5) + torch.stack(half_log_dets).sum(0)
+
+
+def _check_shapes(*expected: tuple[str, Tensor, tuple[int, ...]], because: str) -> None:
+    for name, tensor, shape in expected:
+        if tensor.shape != shape:
+            raise ValueError(
+                f"{name} must have shape {shape}, as {because} says, got {tuple(tensor.shape)}."
+            )
 
 
 # Action spaces are small and batches large: unrolled over the action dimensions, products with

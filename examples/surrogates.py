@@ -8,6 +8,7 @@ import torch
 from critics import minibatches
 from descent import Descent
 from omegaconf import DictConfig
+from policy_steps import moments
 from tensordict import TensorDict, TensorDictBase
 from torch import nn
 from torchrl.envs import EnvBase
@@ -62,19 +63,18 @@ def surrogate_closure(
     reward_loss: ReturnSurrogateLoss,
     cost_loss: CVaRSurrogateLoss,
     data: TensorDictBase,
-    moments: CostMoments,
+    cost_moments: CostMoments,
 ) -> Callable[[], TensorDict]:
     """Objective, constraint and policy moments as a function of the policy's weights."""
 
     def closure() -> TensorDict:
         dist = policy.get_dist(data)
         log_prob = dist.log_prob(data["action"])
-        mean, cov = dist.moments
         return TensorDict(
             {
                 "objective": reward_loss.objective(data, log_prob),
-                "constraint": cost_loss.constraint(data, log_prob, moments)[None],
-                "statistics": {"mean": mean, "cov": cov},
+                "constraint": cost_loss.constraint(data, log_prob, cost_moments)[None],
+                "statistics": moments(dist),
             }
         )
 
@@ -90,13 +90,14 @@ def policy_step(
     batch: TensorDictBase,
 ) -> dict[str, float]:
     """A trust-region step on ``data``; how high the cost stands is measured on ``batch``."""
-    moments = cost_loss.on_policy_moments(batch)
-    report = policy_optim.step(surrogate_closure(policy, reward_loss, cost_loss, data, moments))
+    cost_moments = cost_loss.on_policy_moments(batch)
+    closure = surrogate_closure(policy, reward_loss, cost_loss, data, cost_moments)
+    report = policy_optim.step(closure)
     metrics = report.to_dict()
     limit = cost_loss.cost_limit.item()
     metrics["update/constraint"] += limit
     return {
         **metrics,
         "update/cost_limit": limit,
-        "update/measured_cost_std": moments.variance.sqrt().item(),
+        "update/measured_cost_std": cost_moments.variance.sqrt().item(),
     }

@@ -5,9 +5,9 @@ from __future__ import annotations
 import pytest
 import torch
 from torchrl.data import Binary, Composite, Unbounded
-from torchrl.envs import RewardSum, SerialEnv, TransformedEnv
+from torchrl.envs import RewardSum, SerialEnv, StepCounter, TransformedEnv
 
-from torchrl_safe.envs import ROBOTS, SafeGoalEnv, check_safe_env
+from torchrl_safe.envs import ROBOTS, GoalTask, SafeGoalEnv, check_safe_env
 
 
 def make(cls=SafeGoalEnv, num_envs=4, num_threads=1, episode_length=9, **options):
@@ -202,9 +202,17 @@ def test_torchrls_own_check_comes_first():
         check_safe_env(make(WrongShape))
 
 
-def test_twins():
-    with pytest.raises(AssertionError, match="twin 1 gives another rollout"):
-        check_safe_env(make(), twins=[make(), make(episode_length=5)])
+@pytest.mark.parametrize(
+    ("twin", "difference"),
+    [
+        (lambda: make(episode_length=5), "differs at"),
+        (lambda: make(task=GoalTask(lidar_bins=8)), r"\(20, 4, 16\) and .*\(20, 4, 24\)"),
+        (lambda: TransformedEnv(make(), StepCounter()), "only one has the entries .*step_count"),
+    ],
+)
+def test_twins(twin, difference):
+    with pytest.raises(AssertionError, match=f"twin 1 gives another rollout: .*{difference}"):
+        check_safe_env(make(), twins=[make(), twin()])
 
 
 def test_early_time_limit():

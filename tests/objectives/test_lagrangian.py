@@ -57,6 +57,17 @@ class TestLagrangeMultiplier:
             LagrangeMultiplier(init=init)
 
 
+@pytest.mark.parametrize(
+    ("multiplier", "options"),
+    [
+        (LagrangeMultiplier(2), "num_constraints=2"),
+        (PIDMultiplier(kp=0.5, ki=0.25, kd=0.0), "num_constraints=1, kp=0.5, ki=0.25, kd=0.0"),
+    ],
+)
+def test_repr_tells_the_options(multiplier, options):
+    assert repr(multiplier) == f"{type(multiplier).__name__}({options})"
+
+
 class TestPIDMultiplier:
     def test_algorithm_2_by_hand(self):
         multiplier = PIDMultiplier(kp=1.0, ki=0.5, kd=2.0)

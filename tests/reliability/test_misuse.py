@@ -21,6 +21,12 @@ import pytest
 import torch
 from omegaconf import OmegaConf
 from tensordict import TensorDict
+from tensordict.nn import (
+    CompositeDistribution,
+    ProbabilisticTensorDictModule,
+    ProbabilisticTensorDictSequential,
+    TensorDictModule,
+)
 from torch import nn
 from torch.utils._pytree import tree_leaves
 from torchrl.data import Bounded, Unbounded
@@ -123,6 +129,22 @@ def critic(key: str, *, inputs: int = 5, positive: bool = False) -> ValueOperato
     last = [nn.Softplus()] if positive else []
     keys = ["observation", "action"] if inputs == 5 else ["observation"]
     return ValueOperator(MLP(inputs, 1, num_cells=[4]).extend(last), in_keys=keys, out_keys=[key])
+
+
+@cache
+def two_densities() -> ProbabilisticTensorDictSequential:
+    """An actor whose action has two parts, each with a density of its own."""
+    parts = dict.fromkeys(("speed", "turn"), torch.distributions.Normal)
+    return ProbabilisticTensorDictSequential(
+        TensorDictModule(nn.Identity(), ["observation"], ["params"]),
+        ProbabilisticTensorDictModule(
+            ["params"],
+            list(parts),
+            distribution_class=CompositeDistribution,
+            distribution_kwargs={"distribution_map": parts},
+            return_log_prob=True,
+        ),
+    )
 
 
 def make_tsallis(**options: Any) -> TsallisLoss:
@@ -443,6 +465,23 @@ bad(
     "actor",
     "CVaRSurrogateLoss",
     "critic of states and actions",
+)
+bad(
+    "RetraceEstimator.for_loss: shifted",
+    lambda: RetraceEstimator.for_loss(tsallis(), gamma=0.9, lmbda=0.9, shifted=True),
+    ValueError,
+    "shifted",
+    "True",
+    "the loss computes",
+    state=weights(tsallis),
+)
+bad(
+    "RetraceEstimator: an actor of two densities",
+    lambda: make_retrace(actor_network=two_densities()),
+    ValueError,
+    "actor_network",
+    "['speed_log_prob', 'turn_log_prob']",
+    "one log-density for the whole action",
 )
 column = zeros(4, 1)
 estimates = {
@@ -1309,7 +1348,7 @@ IMPOSSIBLE = {
     "optim.policy_frames": (0, "at least 1"),
     "optim.curvature_frames": (0, "null or an integer of at least 1"),
     "optim.max_kl": (0.0, "(0, inf)"),
-    "optim.kl": ("moments", "'moment_matched', 'matched_bound'"),
+    "optim.kl": ("moments", "'auto', 'moment_matched', 'matched_bound'"),
     "optim.damping": (-0.1, "[0, inf)"),
     "optim.cg_iters": (0, "at least 1"),
     "optim.backtrack_ratio": (1.0, "(0, 1)"),

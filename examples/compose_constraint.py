@@ -1,6 +1,6 @@
 """A cost constraint added to compose_trpo.py: swing up, but with few steps above 4 rad/s.
 
-    python examples/compose_constraint.py               # at most 10 % of the steps; 2 minutes
+    python examples/compose_constraint.py               # at most 10 % of the steps; a minute
     python examples/compose_constraint.py --limit 0.05  # csv curves in runs/compose_constraint
 
 What it took: a cost, its critics, and one more entry in the optimizer's closure.

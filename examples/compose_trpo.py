@@ -1,6 +1,6 @@
 """Plain TRPO on Pendulum-v1: the optimizer without a constraint, in TorchRL's ``Trainer``.
 
-python examples/compose_trpo.py   # about 2 minutes; csv curves in runs/compose_trpo
+python examples/compose_trpo.py   # half a minute; csv curves in runs/compose_trpo
 """
 
 from __future__ import annotations

@@ -185,7 +185,7 @@ RULES: dict[str, Rule] = {
     "optim.policy_frames": integer(1),
     "optim.curvature_frames": optional(integer(1)),
     "optim.max_kl": number("(0, inf)"),
-    "optim.kl": one_of(*DISTANCES),
+    "optim.kl": one_of("auto", *DISTANCES),
     "optim.damping": number("[0, inf)"),
     "optim.cg_iters": integer(1),
     "optim.backtrack_ratio": number("(0, 1)"),

@@ -47,15 +47,25 @@ class Distance(NamedTuple):
     kl: Callable[[TensorDictBase, TensorDictBase], Tensor]
 
 
-DISTANCES = {
-    "moment_matched": Distance(moments, moment_kl),
-    "matched_bound": Distance(parameters, bound_kl),
-}
-"""For one component they are the same."""
+MOMENT_MATCHED = Distance(moments, moment_kl)
+MATCHED_BOUND = Distance(parameters, bound_kl)  # for one component, the same
+
+DISTANCES = {"moment_matched": MOMENT_MATCHED, "matched_bound": MATCHED_BOUND}
+
+
+def choose_distance(cfg: DictConfig) -> Distance:
+    """The distance of ``optim.kl``.
+
+    ``auto`` is the paper's for the robot that learns more with it, and for the others the one that
+    keeps components from collapsing (docs/experiments.md, "The distance of mixtures").
+    """
+    if cfg.optim.kl == "auto":
+        return MOMENT_MATCHED if cfg.env.robot == "point" else MATCHED_BOUND
+    return DISTANCES[cfg.optim.kl]
 
 
 def make_trust_region(
-    cfg: DictConfig, policy: GMMTanhPolicy, distance: str = "moment_matched"
+    cfg: DictConfig, policy: GMMTanhPolicy, distance: Distance = MOMENT_MATCHED
 ) -> TrustRegionSafeOptimizer:
     """The optimizer of the policy, with the options of the configuration."""
     return TrustRegionSafeOptimizer(
@@ -66,7 +76,7 @@ def make_trust_region(
         backtrack_ratio=cfg.optim.backtrack_ratio,
         max_backtracks=cfg.optim.max_backtracks,
         recovery_ratio=cfg.optim.recovery_ratio,
-        statistics_kl=DISTANCES[distance].kl,
+        statistics_kl=distance.kl,
     )
 
 

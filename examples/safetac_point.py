@@ -24,9 +24,11 @@ from critics import (
 from descent import Descent
 from omegaconf import DictConfig
 from policy_steps import (
-    DISTANCES,
+    MOMENT_MATCHED,
+    Distance,
     Multiplier,
     ascend,
+    choose_distance,
     cost_limit_at,
     make_trust_region,
 )
@@ -44,7 +46,7 @@ def policy_closure(
     states: TensorDictBase,
     level: torch.Tensor | None = None,
     curvature_frames: int | None = None,
-    distance: str = "moment_matched",
+    distance: Distance = MOMENT_MATCHED,
 ) -> Callable[[], TensorDict]:
     """Objective, constraint and statistics of (13) as a function of the policy's weights.
 
@@ -53,7 +55,6 @@ def policy_closure(
     The noise of the actions is drawn here, once: the line search then compares policies, not draws.
     Curvature is that of the first ``curvature_frames`` states, all of them by default.
     """
-    statistics = DISTANCES[distance].statistics
     with torch.no_grad():
         dist = policy.get_dist(states)
         noise = dist.draw_noise()
@@ -69,10 +70,11 @@ def policy_closure(
             "constraint": cost_loss.constraint(states, action, reference=reference, level=level)[
                 None
             ],
-            "statistics": statistics(dist),
+            "statistics": distance.statistics(dist),
         }
         if curvature_frames is not None:
-            out["curvature_statistics"] = statistics(policy.get_dist(states[:curvature_frames]))
+            some = policy.get_dist(states[:curvature_frames])
+            out["curvature_statistics"] = distance.statistics(some)
         return TensorDict(out)
 
     return closure
@@ -92,7 +94,8 @@ def main(cfg: DictConfig) -> None:
     fit_critics = CriticFit(cfg, buffer, reward_loss, cost_loss, critic_optim)
     components = {}
     if cfg["update"] == "trust_region":  # as an attribute, update is a method of the configuration
-        policy_optim = make_trust_region(cfg, policy, cfg.optim.kl)
+        distance = choose_distance(cfg)
+        policy_optim = make_trust_region(cfg, policy, distance)
     else:  # (9), the ablation
         policy_optim = torch.optim.Adam(
             policy.parameters(), lr=cfg.lagrangian.policy_lr, fused=True
@@ -130,7 +133,7 @@ def main(cfg: DictConfig) -> None:
                     states,
                     level,
                     cfg.optim.curvature_frames,
-                    cfg.optim.kl,
+                    distance,
                 )
                 metrics |= policy_optim.step(closure).to_dict()
             else:

@@ -176,9 +176,10 @@ def claims(
 
         low, high = stratified_interval(pair, difference)
         verdict = "holds" if low > 0 else "fails" if high < 0 else "open"
+        interval = f"{low:+.3g} to {high:+.3g}"
         if min(map(len, pair)) < 2:
-            verdict = "open"
-        here = f"{difference(np.concatenate(pair)):+.3g} ({low:+.3g} to {high:+.3g})"
+            verdict, interval = "open", "one seed"
+        here = f"{difference(np.concatenate(pair)):+.3g} ({interval})"
         lines.append(f"| {text} | {published:+.3g} | {here} | {verdict} |")
     return "\n".join(lines) + "\n"
 

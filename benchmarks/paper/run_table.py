@@ -29,7 +29,7 @@ from typing import NamedTuple
 ROOT = Path(__file__).parents[2]
 
 SAFETAC = ("safetac_point", "policy.num_components=1")
-SAFETAC_K5 = ("safetac_point", "policy.num_components=5", "loss.entropic_index=1.2")
+MIXTURE = ("safetac_point", "loss.entropic_index=1.2")
 # A limit that falls starves a multiplier, so theirs is the same throughout.
 MULTIPLIER = (*SAFETAC, "loss.entropic_index=1.0", "loss.initial_cost_limit=${loss.cost_limit}")
 METHODS: dict[str, tuple[str, ...]] = {
@@ -41,9 +41,9 @@ METHODS: dict[str, tuple[str, ...]] = {
     "wcsac": ("wcsac",),
     "sac_lagrangian": ("sac_lagrangian",),
     "cpo": ("cpo",),
-    "safetac_k3": ("safetac_point", "policy.num_components=3", "loss.entropic_index=1.2"),
-    "safetac_k5": SAFETAC_K5,
-    "safetac_k5_matched": (*SAFETAC_K5, "optim.kl=matched_bound"),
+    "safetac_k3": (*MIXTURE, "policy.num_components=3", "optim.kl=moment_matched"),
+    "safetac_k5": (*MIXTURE, "policy.num_components=5", "optim.kl=moment_matched"),
+    "safetac_k5_matched": (*MIXTURE, "policy.num_components=5", "optim.kl=matched_bound"),
     "safetac_lmbda0": (*SAFETAC, "loss.entropic_index=1.0", "loss.lmbda=0"),
     "safetac_lagrangian": (*MULTIPLIER, "update=lagrangian"),
     "safetac_pid": (*MULTIPLIER, "update=pid"),

@@ -146,7 +146,9 @@ def test_claims():
     assert verdicts["SafeTAC scores more than WCSAC"] == "open"
     assert verdicts["CPO violates more than SafeTAC"] == "open"  # a difference of nothing
     assert "q = 1.2 scores more than q = 1" not in verdicts
+    here = {claim: difference for claim, _, difference, _ in rows}
     assert rows[0][1:3] == ["+2.4", "+5 (+4 to +6)"]
+    assert here["SafeTAC scores more than WCSAC"] == "+8.5 (one seed)"
 
 
 def test_smoothing_keeps_a_line():

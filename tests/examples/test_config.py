@@ -7,6 +7,7 @@ import config
 import hydra
 import pytest
 from omegaconf import OmegaConf, open_dict
+from policy_steps import MATCHED_BOUND, MOMENT_MATCHED, choose_distance
 
 EXAMPLES = Path(config.__file__).parent
 CONFIGS = sorted(path.stem for path in EXAMPLES.glob("*.yaml"))
@@ -99,3 +100,16 @@ def test_missing_extra(monkeypatch, option, backend):
     )
     with pytest.raises(ModuleNotFoundError, match=rf"pip install 'torchrl-safe\[{backend}\]'"):
         config.check_config(compose("safetac_point", f"{option}.backend={backend}"))
+
+
+@pytest.mark.parametrize(
+    ("overrides", "distance"),
+    [
+        ([], MOMENT_MATCHED),
+        (["env.robot=jackal"], MATCHED_BOUND),
+        (["env.robot=jackal", "optim.kl=moment_matched"], MOMENT_MATCHED),
+        (["optim.kl=matched_bound"], MATCHED_BOUND),
+    ],
+)
+def test_distance_of_a_robot(overrides, distance):
+    assert choose_distance(compose("safetac_point", *overrides)) is distance

@@ -14,7 +14,7 @@ import critics
 import pytest
 import torch
 import utils
-from policy_steps import DISTANCES
+from policy_steps import DISTANCES, MOMENT_MATCHED, Distance
 from tensordict import TensorDict
 from test_host_sync import HostReads
 from tiny import config, launch
@@ -114,7 +114,7 @@ def make_data(batch: tuple[int, int] = (6, 7)) -> TensorDict:
     return with_policy(data, make_blocks("cpu")[0])
 
 
-def make_closure(policy, reward_loss, cost_loss, states, noise, distance="moment_matched"):
+def make_closure(policy, reward_loss, cost_loss, states, noise, distance=MOMENT_MATCHED):
     """Noise is given, since generators of two devices differ."""
 
     def closure() -> TensorDict:
@@ -123,13 +123,13 @@ def make_closure(policy, reward_loss, cost_loss, states, noise, distance="moment
         return TensorDict(
             objective=reward_loss.objective(states, action, log_prob).mean(),
             constraint=cost_loss.constraint(states, action)[None],
-            statistics=TensorDict(DISTANCES[distance].statistics(dist)),
+            statistics=TensorDict(distance.statistics(dist)),
         )
 
     return closure
 
 
-def learn(device: str, distance: str) -> dict[str, torch.Tensor]:
+def learn(device: str, distance: Distance) -> dict[str, torch.Tensor]:
     """What every block gives on a device."""
     policy, reward_loss, cost_loss = make_blocks(device)
     data = make_data().to(device)
@@ -150,16 +150,14 @@ def learn(device: str, distance: str) -> dict[str, torch.Tensor]:
     ):
         out |= {f"{name} {i}": p.grad for i, p in enumerate(params.parameters())}
     states = data.select("observation")
-    optim = TrustRegionSafeOptimizer(
-        policy.parameters(), max_kl=0.01, statistics_kl=DISTANCES[distance].kl
-    )
+    optim = TrustRegionSafeOptimizer(policy.parameters(), max_kl=0.01, statistics_kl=distance.kl)
     report = optim.step(make_closure(policy, reward_loss, cost_loss, states, noise, distance))
     assert report.accepted, report
     return out | {f"weight {i}": p for i, p in enumerate(policy.parameters())}
 
 
 @pytest.mark.parametrize("device", [GPU])
-@pytest.mark.parametrize("distance", DISTANCES)
+@pytest.mark.parametrize("distance", DISTANCES.values(), ids=DISTANCES)
 def test_numbers_are_those_of_the_cpu(device, distance):
     expected, actual = learn("cpu", distance), learn(device, distance)
     for name, value in expected.items():
@@ -225,7 +223,7 @@ def test_host_waits_for_the_line_search_alone(device):
             policy.parameters(),
             max_kl=1e-4,
             cg_iters=iterations,
-            statistics_kl=DISTANCES["moment_matched"].kl,
+            statistics_kl=MOMENT_MATCHED.kl,
         )
         closure = make_closure(policy, reward_loss, cost_loss, states, noise)
         optim.step(closure)

@@ -15,6 +15,7 @@ import pytest
 import safetac_point
 import torch
 import utils
+from policy_steps import MATCHED_BOUND
 from torch.utils._pytree import tree_leaves
 
 from torchrl_safe import record
@@ -46,7 +47,7 @@ class Update:
         self.policy = utils.make_policy(self.cfg, env)
         self.losses = critics.make_losses(self.cfg, env, self.policy)
         self.critic_optim = critics.make_critic_optim(self.cfg, *self.losses)
-        self.policy_optim = policy_steps.make_trust_region(self.cfg, self.policy, "matched_bound")
+        self.policy_optim = policy_steps.make_trust_region(self.cfg, self.policy, MATCHED_BOUND)
         with torch.no_grad():  # as collectors do
             self.batch = env.rollout(50, self.policy, break_when_any_done=False)
         self.batch["collector", "traj_ids"] = torch.arange(4)[:, None].expand(4, 50).clone()
@@ -64,7 +65,7 @@ class Update:
                 *self.losses,
                 batch.select("observation").flatten(),
                 self.losses[1].on_policy_cvar(batch),
-                distance="matched_bound",
+                distance=MATCHED_BOUND,
             )
         )
 
@@ -163,7 +164,7 @@ def test_curvature_products_and_policy_gradients(update, bad, where):
 
     param = next(update.policy.parameters())
     hook = param.register_hook(lambda grad: grad * bad if where == "gradient" else grad)
-    optim = policy_steps.make_trust_region(update.cfg, update.policy, "matched_bound")
+    optim = policy_steps.make_trust_region(update.cfg, update.policy, MATCHED_BOUND)
     optim.statistics_kl = spoiled
     good, update.policy_optim = update.policy_optim, optim
     try:

@@ -105,9 +105,9 @@ def run(command: str, arguments: Iterable[str] = ()) -> str:
                 raise RuntimeError(f"took more than {TIMEOUT} seconds") from interruption
             raise
     if process.returncode:
-        lines = (error or out).strip().splitlines()
-        last = lines[-1] if lines else "no output"
-        raise RuntimeError(f"exit status {process.returncode}: {last}")
+        failed = [line for line in out.splitlines() if line.startswith("FAILED ")]  # pytest's
+        lines = failed or (error or out).strip().splitlines() or ["no output"]
+        raise RuntimeError(f"exit status {process.returncode}: {lines[-1]}")
     return out.strip()
 
 

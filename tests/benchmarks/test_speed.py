@@ -37,6 +37,10 @@ def test_a_table_per_group_in_units_of_its_first_row():
     ("command", "message"),
     [
         ("python -c 1/0", "exit status 1: ZeroDivisionError: division by zero"),
+        (  # as pytest ends, whose standard error says something else
+            "python -c print('FAILED a.py::test');import sys;sys.exit('Wrote results.')",
+            "exit status 1: FAILED a.py::test",
+        ),
         ("python -c __import__('time').sleep(60)", "took more than 3 seconds"),
     ],
 )

@@ -368,9 +368,23 @@ def test_units_do_not_matter():
         assert np.allclose(p.step(p.solve()), x, rtol=1e-6, atol=1e-9 * np.abs(x).max())
 
 
+def test_single_precision_is_solved_in_double():
+    p = Problem(np.random.default_rng(0), m=3)
+    arguments = [x.astype(np.float32) for x in (p.r, p.s, p.c)]
+    single = solve_subproblem(p.q, *arguments, p.delta)
+    double = solve_subproblem(p.q, *(x.astype(np.float64) for x in arguments), p.delta)
+    assert single.objective_weight == double.objective_weight
+    assert (single.constraint_weight == double.constraint_weight).all()
+
+
+@pytest.mark.parametrize(("r", "s"), [((2,), (1, 1)), ((1,), (2, 2)), ((1,), (1,))])
+def test_shapes(r, s):
+    with pytest.raises(ValueError, match=r"shapes \[m\], \[m, m\] and \[m\], got \(") as info:
+        solve_subproblem(1.0, np.zeros(r), np.ones(s), [0.0], 0.5)
+    assert f"got {r}, {s}, (1,)." in str(info.value)
+
+
 def test_misuse():
-    with pytest.raises(ValueError, match=r"shapes \[m\], \[m, m\] and \[m\], got \(2,\)"):
-        solve_subproblem(1.0, [0.0, 0.0], [[1.0]], [0.0], 0.5)
     m = MAX_CONSTRAINTS + 1
     with pytest.raises(ValueError, match=f"at most {MAX_CONSTRAINTS} constraints .* got {m}"):
         solve_subproblem(1.0, np.zeros(m), np.eye(m), np.zeros(m), 0.5)

@@ -118,14 +118,20 @@ def test_definition(batch: tuple[int, ...], features: int, steps: int, vectorize
 def by_loop(gamma, lmbda, inputs: dict[str, Tensor]) -> Tensor:
     """One backward pass over time; the definition without its double sum."""
     x = {name: tensor.movedim(-2, 0) for name, tensor in inputs.items()}
-    gamma = torch.as_tensor(gamma).to(x["reward"]).expand(inputs["reward"].shape).movedim(-2, 0)
+    reward = inputs["reward"]
+    gamma, lmbda = (
+        torch.as_tensor(value, dtype=reward.dtype, device=reward.device)
+        .expand(reward.shape)
+        .movedim(-2, 0)
+        for value in (gamma, lmbda)
+    )
     target, following = [], None
     for t in reversed(range(len(x["reward"]))):
         value = x["reward"][t] + gamma[t] * x["next_state_value"][t].masked_fill(
             x["terminated"][t], 0
         )
         if following is not None:
-            trace = lmbda * (x["log_pi"][t + 1] - x["log_mu"][t + 1]).exp().clamp_max(1)
+            trace = lmbda[t] * (x["log_pi"][t + 1] - x["log_mu"][t + 1]).exp().clamp_max(1)
             ahead = gamma[t] * trace * (following - x["action_value"][t + 1])
             value = value + ahead.masked_fill(x["done"][t], 0)
         target.append(value)
@@ -259,6 +265,15 @@ def test_discount_per_step() -> None:
     moved = {name: tensor.transpose(0, 1) for name, tensor in inputs.items()}
     target = retrace_lambda_return_estimate(gamma.transpose(0, 1), LMBDA, **moved, time_dim=0)
     torch.testing.assert_close(target, expected.transpose(0, 1))
+
+
+@pytest.mark.parametrize("vectorized", [True, False])
+def test_trace_decay_per_step(vectorized: bool) -> None:
+    """That of a step is from it to the next, as its discount is."""
+    inputs = make_inputs(2, steps=9, features=2)
+    lmbda = torch.rand(2, 9, 1, dtype=torch.float64)
+    target = retrace_lambda_return_estimate(GAMMA, lmbda, **inputs, vectorized=vectorized)
+    torch.testing.assert_close(target, by_loop(GAMMA, lmbda, inputs))
 
 
 @pytest.mark.parametrize("shape", [(), (1,), (1, 1, 1)])

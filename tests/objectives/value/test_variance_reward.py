@@ -85,6 +85,16 @@ def test_variance_reward_masks_the_bootstrap() -> None:
 
 
 @REWARDS
+def test_discount_per_step(reward) -> None:
+    mean, next_mean, cost = torch.rand(3, 2, 4, 1, dtype=torch.float64)
+    gamma, end = torch.rand(2, 4, 1, dtype=torch.float64), torch.rand(2, 4, 1) > 0.5
+    rows = zip(*(x.flatten() for x in (gamma, cost, mean, next_mean, end)), strict=True)
+    expected = torch.cat([reward(row[0].item(), *(x[None, None] for x in row[1:])) for row in rows])
+    actual = reward(gamma, cost, mean, next_mean, end)
+    torch.testing.assert_close(actual.flatten(), expected.flatten())
+
+
+@REWARDS
 @pytest.mark.parametrize("name", ["action_value", "next_action_value", "terminated"])
 def test_variance_reward_checks(name: str, reward) -> None:
     inputs = {

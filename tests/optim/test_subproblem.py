@@ -286,30 +286,43 @@ def test_parallel_and_antiparallel_gradients(sign, d, noise):
     assert x == pytest.approx(expected, abs=1e-4)
 
 
+def assert_rejected(solution, reason):
+    assert solution.case == "rejected"
+    assert solution.reason == reason
+    assert solution.objective_weight == 0
+    assert (solution.constraint_weight == 0).all()
+    assert solution.constraint_weight.dtype == np.float64
+
+
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
 @pytest.mark.parametrize("where", ["q", "r", "s", "c", "max_kl"])
 def test_numbers_that_are_not_finite_are_rejected(bad, where):
     values = {"q": 1.0, "r": [0.5], "s": [[1.0]], "c": [0.1], "max_kl": 0.5}
     values[where] = np.full(np.shape(values[where]), bad)[()]
-    solution = solve_subproblem(**values)
-    assert solution.case == "rejected"
-    assert solution.reason == "non-finite products of the gradients"
-    assert solution.objective_weight == 0
-    assert (solution.constraint_weight == 0).all()
+    assert_rejected(solve_subproblem(**values), "non-finite products of the gradients")
 
 
 @pytest.mark.parametrize(
     ("q", "s", "c", "reason"),
     [
-        (-1.0, 1.0, -1.0, "not positive definite"),
-        (1.0, -1.0, -1.0, "not positive definite"),
+        (-1.0, 1.0, -1.0, "the curvature is not positive definite"),
+        (1.0, -1.0, -1.0, "the curvature is not positive definite"),
         (1.0, 0.0, 1.0, "a violated constraint has no gradient"),
     ],
 )
 def test_rejections(q, s, c, reason):
-    solution = solve_subproblem(q, [0.0], [[s]], [c], max_kl=0.5)
-    assert solution.case == "rejected"
-    assert reason in solution.reason
+    assert_rejected(solve_subproblem(q, [0.0], [[s]], [c], max_kl=0.5), reason)
+
+
+def test_no_objective_and_nothing_to_repair():
+    for c, case in (([-5.0], "inert"), ([], "unconstrained")):
+        m = len(c)
+        solution = solve_subproblem(0.0, np.zeros(m), np.eye(m), np.array(c), max_kl=0.5)
+        assert (solution.case, solution.objective_weight) == (case, 0.0)
+
+
+def test_a_constraint_beyond_the_largest_number_is_inert():
+    assert solve_subproblem(1.0, [0.0], [[1e-300]], [-1e300], max_kl=0.5).case == "inert"
 
 
 def test_products_that_no_vectors_have_are_rejected():
@@ -318,16 +331,12 @@ def test_products_that_no_vectors_have_are_rejected():
     gram = np.block([[np.ones((1, 1)), np.array([r])], [np.array([r]).T, np.array(s)]])
     assert np.linalg.eigvalsh(gram)[0] < -0.1
     solution = solve_subproblem(1.0, r, s, [-0.8, -0.2], max_kl=0.5)
-    assert solution.case == "rejected"
-    assert solution.reason == "the curvature is not positive definite"
-    assert solution.objective_weight == 0
-    assert (solution.constraint_weight == 0).all()
+    assert_rejected(solution, "the curvature is not positive definite")
 
 
 def test_opposite_violated_constraints_are_rejected():
     solution = solve_subproblem(1, [0, 0], [[1, -1], [-1, 1]], [0.5, 0.5], max_kl=0.5)
-    assert solution.case == "rejected"
-    assert "no direction lowers" in solution.reason
+    assert_rejected(solution, "no direction lowers the largest violation")
 
 
 def test_a_repeated_constraint_changes_nothing():

@@ -103,7 +103,7 @@ def test_variance_reward_checks(name: str, reward) -> None:
         "next_action_value": torch.ones(3, 1),
         "terminated": torch.zeros(3, 1, dtype=torch.bool),
     }
-    with pytest.raises(ValueError, match=rf"{name} must have shape \(3, 1\)"):
+    with pytest.raises(ValueError, match=rf"^{name} must have shape \(3, 1\), that of cost, got"):
         reward(0.9, **{**inputs, name: inputs[name][:2]})
     with pytest.raises(ValueError, match="gamma must be in"):
         reward(1.5, **inputs)

@@ -15,14 +15,11 @@ from torch import Tensor
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.modules.distributions.utils import sample_and_log_prob
 from torchrl.objectives import LossModule, distance_loss
-from torchrl.objectives.utils import (
-    ValueEstimators,
-    _vmap_func,
-    build_value_estimator,
-)
+from torchrl.objectives.utils import ValueEstimators, build_value_estimator
 from torchrl.objectives.value import ValueEstimatorBase
 
 from torchrl_safe.objectives.functional import check_regression, check_risk_level, gaussian_cvar
+from torchrl_safe.objectives.utils import ensemble
 from torchrl_safe.objectives.value import (
     RetraceEstimator,
     retrace_variance_reward,
@@ -216,11 +213,8 @@ class CVaRCostLoss(LossModule):
 
     def _make_vmap(self) -> None:
         self._vmap_cost_network, self._vmap_std_network = (
-            _vmap_func(
-                network,
-                (None, 0),
-                randomness=self.vmap_randomness,
-                pseudo_vmap=self.deactivate_vmap,
+            ensemble(
+                network, randomness=self.vmap_randomness, deactivate_vmap=self.deactivate_vmap
             )
             for network in (self.cost_network, self.std_network)
         )

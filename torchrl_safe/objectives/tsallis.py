@@ -21,6 +21,7 @@ from torchrl_safe.objectives.functional import (
     q_logarithm,
     uniform_tsallis_entropy,
 )
+from torchrl_safe.objectives.utils import ensemble
 
 
 class TsallisLoss(SACLoss):
@@ -176,6 +177,13 @@ class TsallisLoss(SACLoss):
             scalar_output_mode=scalar_output_mode,
         )
         self.entropic_index = entropic_index
+
+    def _make_vmap(self) -> None:
+        self._vmap_qnetworkN0 = ensemble(
+            self.qvalue_network,
+            randomness=self.vmap_randomness,
+            deactivate_vmap=self.deactivate_vmap,
+        )
 
     @property
     def target_entropy(self) -> Tensor:

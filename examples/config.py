@@ -181,6 +181,7 @@ RULES: dict[str, Rule] = {
     "optim.critic_rounds": integer(1),
     "optim.critic_frames": integer(1),
     "optim.minibatch_size": integer(1),
+    "optim.compile": BOOLEAN,
     "optim.cuda_graphs": BOOLEAN,
     "optim.policy_frames": integer(1),
     "optim.curvature_frames": optional(integer(1)),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import torch
@@ -11,7 +11,7 @@ from descent import Descent
 from omegaconf import DictConfig
 from tensordict import TensorDictBase
 from tensordict.nn import CudaGraphModule
-from torch import nn
+from torch import Tensor, nn
 from torchrl._utils import timeit
 from torchrl.data import (
     LazyMemmapStorage,
@@ -95,6 +95,7 @@ def make_buffer(cfg: DictConfig) -> TensorDictReplayBuffer:
             slice_len=cfg.replay_buffer.slice_len,
             traj_key=("collector", "traj_ids"),
             strict_length=True,
+            cache_values=True,  # of one update, until the next batch comes
         ),
     )
 
@@ -104,7 +105,7 @@ class CriticFit:
 
     On a GPU the targets of a round are one CUDA graph and its gradient steps another: they are
     thousands of small kernels, which would wait for Python to launch them one by one. The first
-    two rounds, which run as on a CPU, settle what is settled once.
+    two rounds, which run as on a CPU, settle what is settled once. On a CPU both can be compiled.
 
     Args:
         cfg (DictConfig): the run's configuration.
@@ -126,18 +127,33 @@ class CriticFit:
         self.buffer = buffer
         self.descent = Descent(cfg, optim)
 
+        def targets_of(part: TensorDictBase) -> tuple[Tensor, Tensor, Tensor]:
+            return reward_loss.compute_target(part), *cost_loss.compute_target(part)
+
+        def losses_of(minibatch: TensorDictBase) -> TensorDictBase:
+            losses = cost_loss(minibatch)
+            losses["loss_qvalue"], _ = reward_loss.qvalue_v2_loss(minibatch)
+            return losses
+
+        on_gpu = torch.device(cfg.device).type == "cuda"
+        if cfg.optim.compile and not on_gpu:
+            warnings.filterwarnings("ignore", ".*inline_inbuilt_nn_modules", FutureWarning)
+            # Sizes that come up are few: the last minibatch is smaller than the others.
+            targets_of, losses_of = (
+                torch.compile(function, dynamic=False) for function in (targets_of, losses_of)
+            )
+
         def add_targets(trajectories: TensorDictBase) -> TensorDictBase:
-            return with_targets(trajectories, reward_loss, cost_loss)
+            return with_targets(trajectories, reward_loss.actor_network, targets_of)
 
         def descend(data: TensorDictBase) -> TensorDictBase:
             for minibatch in minibatches(data, cfg.optim.minibatch_size):
-                losses = cost_loss(minibatch)
-                losses["loss_qvalue"], _ = reward_loss.qvalue_v2_loss(minibatch)
+                losses = losses_of(minibatch)
                 self.descent.step(losses)
             return losses.detach()
 
         self._add_targets, self._descend = add_targets, descend
-        if torch.device(cfg.device).type == "cuda" and cfg.optim.cuda_graphs:
+        if on_gpu and cfg.optim.cuda_graphs:
             # A graph is recorded on a stream of its own, and CudaGraphModule takes tensordicts out
             # of PyTree, where nothing here needs them.
             warnings.filterwarnings("ignore", "The AccumulateGrad node's stream")
@@ -165,15 +181,16 @@ class CriticFit:
 
 
 def with_targets(
-    trajectories: TensorDictBase, reward_loss: TsallisLoss, cost_loss: CVaRCostLoss
+    trajectories: TensorDictBase,
+    actor: GMMTanhPolicy,
+    targets_of: Callable[[TensorDictBase], tuple[Tensor, Tensor, Tensor]],
 ) -> TensorDictBase:
     """Transitions of trajectories [B, T] with the targets of (4) and (18), flat."""
     parts = []
     for part in trajectories.split(250):  # activations of this many stay in the cache
-        part = with_policy(part, reward_loss.actor_network, shifted=True)
-        target = reward_loss.compute_target(part)
-        cost_target, std_target = cost_loss.compute_target(part)
-        targets = {"value_target": target, "cost_target": cost_target, "std_target": std_target}
+        part = with_policy(part, actor, shifted=True)
+        names = ("value_target", "cost_target", "std_target")
+        targets = dict(zip(names, targets_of(part), strict=True))
         parts.append(part.select("observation", "action").update(targets))
     return torch.cat(parts).flatten()
 

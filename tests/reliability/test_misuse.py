@@ -1344,6 +1344,7 @@ IMPOSSIBLE = {
     "optim.critic_rounds": (0, "at least 1"),
     "optim.critic_frames": (0, "at least 1"),
     "optim.minibatch_size": (0, "at least 1"),
+    "optim.compile": (1, "one of True, False"),
     "optim.cuda_graphs": (1, "one of True, False"),
     "optim.policy_frames": (0, "at least 1"),
     "optim.curvature_frames": (0, "null or an integer of at least 1"),

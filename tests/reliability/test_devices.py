@@ -9,6 +9,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import partial
 
 import critics
 import pytest
@@ -266,6 +267,39 @@ def test_cuda_graphs_learn_the_same(device, tmp_path):
         ends.append([p.detach() for p in optim.param_groups[0]["params"]])
     for eager, graph in zip(*ends, strict=True):
         torch.testing.assert_close(graph, eager, rtol=1e-3, atol=1e-5)
+
+
+@pytest.mark.filterwarnings(
+    "ignore:.*inline_inbuilt_nn_modules:FutureWarning",
+    "ignore:.*autograd.Function:DeprecationWarning",
+)
+@pytest.mark.parametrize("backend", ["eager", pytest.param("inductor", marks=pytest.mark.long)])
+def test_compiled_critics_learn_the_same(backend, tmp_path, monkeypatch):
+    """Targets and losses are one graph each, and what they teach is what they teach without."""
+    ends = []
+    for compiled in (False, True):
+        torch.manual_seed(0)
+        cfg = config(tmp_path, f"optim.compile={compiled}", "optim.minibatch_size=70")
+        env = utils.make_env(cfg, 4, seed=0)
+        policy = utils.make_policy(cfg, env)
+        losses = critics.make_losses(cfg, env, policy)
+        optim = critics.make_critic_optim(cfg, *losses)
+        buffer = critics.make_buffer(cfg)
+        with torch.no_grad():
+            batch = env.rollout(50, policy, break_when_any_done=False)
+        batch["collector", "traj_ids"] = torch.arange(4)[:, None].expand(4, 50).clone()
+        buffer.extend(batch.select(*critics.REPLAYED))
+        compile_ = partial(torch.compile, backend=backend, fullgraph=True)
+        with monkeypatch.context() as patch:
+            patch.setattr(torch, "compile", compile_)
+            fit = critics.CriticFit(cfg, buffer, *losses, optim)
+        before = [p.detach().clone() for p in optim.param_groups[0]["params"]]
+        for _ in range(3):
+            assert fit()["update/skipped_steps"] == 0
+        ends.append([p.detach() for p in optim.param_groups[0]["params"]])
+        assert not any(map(torch.equal, before, ends[-1]))
+    for eager, compiled in zip(*ends, strict=True):
+        torch.testing.assert_close(compiled, eager, rtol=1e-4, atol=1e-6)
 
 
 @pytest.mark.parametrize("device", [GPU])

@@ -213,9 +213,7 @@ class CVaRCostLoss(LossModule):
 
     def _make_vmap(self) -> None:
         self._vmap_cost_network, self._vmap_std_network = (
-            ensemble(
-                network, randomness=self.vmap_randomness, deactivate_vmap=self.deactivate_vmap
-            )
+            ensemble(network, randomness=self.vmap_randomness, deactivate_vmap=self.deactivate_vmap)
             for network in (self.cost_network, self.std_network)
         )
 

@@ -227,6 +227,13 @@ def length(vector: Array) -> Array:
     return np.hypot(vector[..., 0], vector[..., 1])
 
 
+def offsets(position: Array, objects: Array) -> Array:
+    """Objects [N, K, 2] minus robots [N, 2]: [N, K, 2], each coordinate in one piece of memory."""
+    planes = np.empty((2, *objects.shape[:-1]))
+    np.subtract(objects.transpose(2, 0, 1), position.T[:, :, None], out=planes)
+    return planes.transpose(1, 2, 0)
+
+
 def check_options(task: Any, smallest: dict[str, int]) -> None:
     """Checks a task's options by the types of their defaults.
 

@@ -8,6 +8,7 @@ and the reward of SafeTAC, equation (19).
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,13 +24,13 @@ from torchrl_safe.envs.tasks.base import (
     check_options,
     length,
     observe,
+    offsets,
     pursue_goal,
 )
 
 _LAYOUT_CANDIDATES = 32  # positions tried for one object before its layout is started again
 _LAYOUT_ATTEMPTS = 100  # layouts started before giving up
 _GOAL_CANDIDATES = 256  # positions tried for a goal that moves during an episode
-_NEIGHBOURS = np.arange(3)[:, None, None]  # of a lidar bin: the one before it, itself, the next one
 
 
 @dataclass(frozen=True)
@@ -246,7 +247,7 @@ def sample_goal(
 
 def hazard_distances(position: Array, hazards: Array) -> tuple[Array, Array]:
     """Offsets [N, H, 2] and distances [N, H] from the robots [N, 2] to the hazards [N, H, 2]."""
-    offset = hazards - position[:, None]
+    offset = offsets(position, hazards)
     return offset, length(offset)
 
 
@@ -272,18 +273,30 @@ def lidar(task: GoalTask, offset: Array, distance: Array, heading: Array) -> Arr
     turn *= bins / (2.0 * np.pi)
     turn += bins * (turn < 0.0)
     centre = turn.astype(np.intp)
-    within = turn - centre
-    reading = np.maximum(0.0, 1.0 - distance / task.lidar_range)
+    within = np.subtract(turn, centre, out=turn)
+    reading = distance / task.lidar_range
+    np.subtract(1.0, reading, out=reading)
+    np.maximum(0.0, reading, out=reading)
+    shares = np.empty((3, *reading.shape))  # of a bin's left neighbour, its own, the right one's
+    np.subtract(1.0, within, out=shares[0])
+    shares[0] *= reading
+    shares[1] = reading
+    np.multiply(within, reading, out=shares[2])
     # Column b + 1 is bin b. The margins, where neighbours across the seam fall, are folded back
     # below; there are two on the right because an angle just below zero can round up to a full
     # turn.
     scan = np.zeros((num_envs, bins + 3))
-    centre += np.arange(0, scan.size, bins + 3)[:, None]
-    shares = np.stack(((1.0 - within) * reading, reading, within * reading))
-    np.maximum.at(scan.reshape(-1), (centre + _NEIGHBOURS).ravel(), shares.ravel())
+    columns = _columns(num_envs, bins + 3) + centre
+    np.maximum.at(scan.reshape(-1), columns.reshape(-1), shares.reshape(-1))
     scan[:, 1:3] = np.maximum(scan[:, 1:3], scan[:, -2:])
     scan[:, bins] = np.maximum(scan[:, bins], scan[:, 0])
     return scan[:, 1:-2]
+
+
+@lru_cache(maxsize=64)
+def _columns(num_envs: int, width: int) -> NDArray[np.intp]:
+    """Where three neighbouring columns of an array [N, width] begin, [3, N, 1], in the flat one."""
+    return np.arange(3)[:, None, None] + np.arange(0, num_envs * width, width)[:, None]
 
 
 def hazard_cost(task: GoalTask, distance: Array) -> tuple[Array, NDArray[np.bool_]]:

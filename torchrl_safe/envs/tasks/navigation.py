@@ -26,6 +26,7 @@ from torchrl_safe.envs.tasks.base import (
     check_options,
     length,
     observe,
+    offsets,
     pursue_goal,
 )
 
@@ -331,7 +332,7 @@ def ray_distances(task: NavigationTask, position: Array, heading: Array, boxes: 
 
     # A box meets few rays, those within the angle of the disc around it: no others are looked at.
     radius = np.sqrt(2.0) * half
-    offset = boxes - position[:, None]
+    offset = offsets(position, boxes)
     x, y = offset[..., 0], offset[..., 1]
     row, column = np.nonzero(x * x + y * y < (task.lidar_range + radius) ** 2)
     x, y = x[row, column], y[row, column]
@@ -391,16 +392,22 @@ def contact(
     """
     half_length, half_width = footprint
     half = task.box_half_size
-    reach = np.abs(heading) * half_length + np.abs(heading[:, ::-1]) * half_width
-    at_wall = (np.abs(position) + reach).max(-1) >= task.wall_distance
-    offset = boxes - position[:, None]
+    size = np.abs(heading)
+    reach = size * half_length + size[:, ::-1] * half_width
+    touching = (np.abs(position) + reach).max(-1) >= task.wall_distance
+    # Few boxes are near enough to be looked at: those whose disc, of sqrt(2) half sides and a
+    # little more, meets the robot's.
+    offset = offsets(position, boxes)
     x, y = offset[..., 0], offset[..., 1]
-    cos, sin = heading[:, :1], heading[:, 1:]
+    near = np.hypot(half_length, half_width) + 1.5 * half
+    row, column = np.nonzero(x * x + y * y < near * near)
+    x, y, (cos, sin) = x[row, column], y[row, column], heading[row].T
     box_reach = half * (np.abs(cos) + np.abs(sin))
-    overlap = (np.abs(offset) <= half + reach[:, None]).all(-1)
+    overlap = (np.abs(offset[row, column]) <= half + reach[row]).all(-1)
     overlap &= np.abs(cos * x + sin * y) <= half_length + box_reach
     overlap &= np.abs(cos * y - sin * x) <= half_width + box_reach
-    return at_wall | overlap.any(-1)
+    touching[row[overlap]] = True
+    return touching
 
 
 def proximity_cost(task: NavigationTask, nearest: Array) -> tuple[Array, Mask]:

@@ -360,7 +360,7 @@ def _one_step_cost(
         _check_shape(name, tensor, cost.shape, "that of cost")
     _check_boolean("terminated", terminated)
     gamma = _coefficient("gamma", gamma, cost.shape)
-    return cost + gamma * torch.where(terminated, 0, next_action_value)
+    return cost + gamma * next_action_value.masked_fill(terminated, 0)
 
 
 def _log_ratio(log_pi: Tensor, log_mu: Tensor, reward: Tensor) -> Tensor:
@@ -405,7 +405,7 @@ def _trace_return_estimate(
         log_trace, action_value, next_state_value, reward = (
             tensor.float() for tensor in (log_trace, action_value, next_state_value, reward)
         )
-    target = reward + gamma * torch.where(terminated, 0, next_state_value)
+    target = reward + gamma * next_state_value.masked_fill(terminated, 0)
     decay = gamma * lmbda
     if isinstance(decay, Tensor) and decay.ndim:
         decay = decay.expand(shape).movedim(time_dim, -1)[..., :-1]
@@ -414,7 +414,7 @@ def _trace_return_estimate(
     )
     # Across a cut the ratio is another trajectory's: masking it before the exponential stops its
     # gradient too, and a NaN in either.
-    trace = torch.where(done[..., :-1], -torch.inf, log_trace[..., 1:]).exp() * decay
+    trace = log_trace[..., 1:].masked_fill(done[..., :-1], -torch.inf).exp() * decay
     head = torch.addcmul(target[..., :-1], trace, action_value[..., 1:], value=-1)
     delta = torch.cat([head, target[..., -1:]], -1)
     solve = _solve_recurrence if vectorized else _loop_recurrence

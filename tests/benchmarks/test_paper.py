@@ -9,6 +9,7 @@ import config
 import hydra
 import make_table
 import numpy as np
+import prediction_error
 import pytest
 import run_table
 import table_2
@@ -180,3 +181,22 @@ def test_from_runs_to_pictures(tmp_path):
     for name in ("table_1.png", "frontier.png"):
         assert (tmp_path / "out" / name).stat().st_size > 5_000
     assert (tmp_path / "out" / "cpo" / "seed_0" / "curves.csv").exists()
+
+
+class TestPredictionError:
+    HEAD = "frames,train/entropy,update/constraint_change,update/constraint_predicted"
+
+    def write(self, folder, *rows):
+        (folder / "curves.csv").write_text("\n".join([self.HEAD, *rows]) + "\n")
+
+    def test_median_of_what_was_logged(self, tmp_path):
+        """Errors of 10 %, 50 % and, of the floor .05, 20 %; the first update has no step."""
+        self.write(tmp_path, "1,-3,,", "2,-1,1,1.1", "3,-2,-1,-0.5", "4,-1,0.01,0.02")
+        error, entropy = prediction_error.prediction_error(tmp_path)
+        assert error == pytest.approx(0.2)
+        assert entropy == -3
+
+    def test_run_of_another_method(self, tmp_path):
+        self.write(tmp_path, "1,-3,,")
+        with pytest.raises(ValueError, match="no trust region's"):
+            prediction_error.prediction_error(tmp_path)

@@ -445,7 +445,8 @@ def _solve_recurrence(coefficient: Tensor, delta: Tensor) -> Tensor:
         length -= stride
         head = coefficient.narrow(-1, 0, length)
         delta = torch.addcmul(delta.narrow(-1, 0, length), head, delta.narrow(-1, stride, length))
-        coefficient = head * coefficient.narrow(-1, stride, length)
+        if length > steps:
+            coefficient = head * coefficient.narrow(-1, stride, length)
     return delta
 
 

@@ -114,12 +114,11 @@ def to_robot_frame(vector: Array, heading: Array, out: Array | None = None) -> A
         >>> to_robot_frame(np.array([0.0, 2.0]), np.array([0.0, 1.0])).tolist()
         [2.0, 0.0]
     """
-    x, y = vector[..., 0], vector[..., 1]
-    cos, sin = heading[..., 0], heading[..., 1]
+    along, across = vector * heading[..., :1], vector * heading[..., 1:]
     if out is None:
         out = np.empty_like(vector)
-    np.add(cos * x, sin * y, out=out[..., 0])
-    np.subtract(cos * y, sin * x, out=out[..., 1])
+    np.add(along[..., 0], across[..., 1], out=out[..., 0])
+    np.subtract(along[..., 1], across[..., 0], out=out[..., 1])
     return out
 
 

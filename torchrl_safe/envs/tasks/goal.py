@@ -271,7 +271,7 @@ def lidar(task: GoalTask, offset: Array, distance: Array, heading: Array) -> Arr
     ahead = to_robot_frame(offset, heading[:, None])
     turn = np.arctan2(ahead[..., 1], ahead[..., 0])
     turn *= bins / (2.0 * np.pi)
-    turn += bins * (turn < 0.0)
+    np.add(turn, bins, out=turn, where=turn < 0.0)
     centre = turn.astype(np.intp)
     within = np.subtract(turn, centre, out=turn)
     reading = distance / task.lidar_range

@@ -21,7 +21,7 @@ from pathlib import Path
 
 import numpy as np
 from matplotlib.figure import Figure
-from matplotlib.ticker import LogLocator
+from matplotlib.ticker import FixedLocator, NullLocator
 from numpy.typing import NDArray
 from scipy.stats import trim_mean
 
@@ -258,10 +258,12 @@ def plot_frontier(
                 textcoords="offset points",
                 fontsize=7,
             )
-    axis.set(xlabel="violations per step", ylabel="score", xscale="log")
-    axis.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+    axis.set(xlabel="violations per step", ylabel="score")
+    # Logarithmic, with a place for those that do not violate at all.
+    axis.set_xscale("symlog", linthresh=1e-3, linscale=0.5)
+    axis.xaxis.set_major_locator(FixedLocator((0, 5e-4, 1e-3, 2e-3, 5e-3, 0.01, 0.02, 0.05, 0.1)))
     axis.xaxis.set_major_formatter("{x:g}")
-    axis.xaxis.set_minor_formatter("")
+    axis.xaxis.set_minor_locator(NullLocator())
     axis.legend(fontsize=8)
     figure.savefig(path, dpi=120)
 

@@ -107,7 +107,7 @@ def by_definition(
 
 
 @pytest.mark.parametrize("vectorized", [True, False])
-@pytest.mark.parametrize("steps", [1, 2, 3, 8, 13, 32])
+@pytest.mark.parametrize("steps", [1, 2, 3, 8, 16, 17, 32, 45])
 @pytest.mark.parametrize(("batch", "features"), [((), 1), ((3,), 1), ((2, 2), 3)])
 def test_definition(batch: tuple[int, ...], features: int, steps: int, vectorized: bool) -> None:
     inputs = make_inputs(*batch, steps=steps, features=features, seed=steps)
@@ -212,7 +212,7 @@ def test_arguments() -> None:
 @pytest.mark.parametrize("vectorized", [True, False])
 @pytest.mark.parametrize("estimate", COEFFICIENTS, ids=lambda estimate: estimate.__name__)
 def test_trace_coefficients(estimate, vectorized: bool, lmbda: float) -> None:
-    inputs = make_inputs(3, steps=9, features=2)
+    inputs = make_inputs(3, steps=19, features=2)
     inputs["log_pi"] = inputs["log_pi"].sigmoid().log()  # probabilities, for Tree-Backup
     expected = by_definition(GAMMA, lmbda, *inputs.values(), coefficient=COEFFICIENTS[estimate])
     needed = {name: x for name, x in inputs.items() if name not in IGNORED.get(estimate, [])}
@@ -258,8 +258,8 @@ def test_importance_sampling_is_monte_carlo() -> None:
 
 
 def test_discount_per_step() -> None:
-    inputs = make_inputs(2, steps=9, features=2)
-    gamma = torch.rand(2, 9, 1, dtype=torch.float64)
+    inputs = make_inputs(2, steps=19, features=2)
+    gamma = torch.rand(2, 19, 1, dtype=torch.float64)
     expected = by_definition(gamma, LMBDA, *inputs.values())
     torch.testing.assert_close(retrace_lambda_return_estimate(gamma, LMBDA, **inputs), expected)
     moved = {name: tensor.transpose(0, 1) for name, tensor in inputs.items()}
@@ -270,8 +270,8 @@ def test_discount_per_step() -> None:
 @pytest.mark.parametrize("vectorized", [True, False])
 def test_trace_decay_per_step(vectorized: bool) -> None:
     """That of a step is from it to the next, as its discount is."""
-    inputs = make_inputs(2, steps=9, features=2)
-    lmbda = torch.rand(2, 9, 1, dtype=torch.float64)
+    inputs = make_inputs(2, steps=19, features=2)
+    lmbda = torch.rand(2, 19, 1, dtype=torch.float64)
     target = retrace_lambda_return_estimate(GAMMA, lmbda, **inputs, vectorized=vectorized)
     torch.testing.assert_close(target, by_loop(GAMMA, lmbda, inputs))
 
@@ -360,7 +360,7 @@ def test_truncation_inside_the_batch() -> None:
 
 @pytest.mark.parametrize("time_dim", [0, 1, 2, -2, -3, -4])
 def test_time_dim(time_dim: int) -> None:
-    inputs = make_inputs(2, 3, steps=5, features=4)
+    inputs = make_inputs(2, 3, steps=18, features=4)
     expected = retrace_lambda_return_estimate(GAMMA, LMBDA, **inputs).movedim(-2, time_dim)
     moved = {name: tensor.movedim(-2, time_dim) for name, tensor in inputs.items()}
     target = retrace_lambda_return_estimate(GAMMA, LMBDA, **moved, time_dim=time_dim)
@@ -423,7 +423,7 @@ def test_coefficient_shape(shape: tuple[int, ...]) -> None:
 
 @pytest.mark.parametrize("vectorized", [True, False])
 def test_gradient(vectorized: bool) -> None:
-    inputs = make_inputs(2, steps=6, features=2)
+    inputs = make_inputs(steps=18, features=2)
     flags = (inputs.pop("done"), inputs.pop("terminated"))
     coefficients = [torch.tensor(value, dtype=torch.float64) for value in (GAMMA, LMBDA)]
     arguments = [tensor.requires_grad_() for tensor in (*coefficients, *inputs.values())]
@@ -434,7 +434,7 @@ def test_gradient(vectorized: bool) -> None:
 
 
 def test_masked_entries_may_be_nan() -> None:
-    inputs = make_inputs(3, steps=12)
+    inputs = make_inputs(3, steps=40)
     inputs["done"][0, 4] = inputs["terminated"][0, 4] = True
     expected = retrace_lambda_return_estimate(GAMMA, LMBDA, **inputs)
     first = torch.ones_like(inputs["done"])
@@ -451,7 +451,7 @@ def test_masked_entries_may_be_nan() -> None:
 
 def test_impossible_actions() -> None:
     # A density of zero under either policy: no trace, or a full one.
-    inputs = make_inputs(3, steps=7)
+    inputs = make_inputs(3, steps=20)
     inputs["log_pi"][:, 3] = -math.inf
     inputs["log_mu"][:, 5] = -math.inf
     finite = {name: tensor.clone() for name, tensor in inputs.items()}
@@ -506,7 +506,7 @@ def test_long_undiscounted_trajectory() -> None:
 
 
 def test_vmap() -> None:
-    inputs = make_inputs(3, 2, steps=6)
+    inputs = make_inputs(3, 2, steps=20)
     expected = retrace_lambda_return_estimate(GAMMA, LMBDA, **inputs)
     target = torch.vmap(lambda *args: retrace_lambda_return_estimate(GAMMA, LMBDA, *args))(
         *inputs.values()
@@ -523,7 +523,7 @@ def test_vmap() -> None:
 
 def test_compile() -> None:
     compiled = torch.compile(retrace_lambda_return_estimate, backend="eager", fullgraph=True)
-    for steps in (6, 9):
+    for steps in (20, 24):
         inputs = make_inputs(2, steps=steps)
         torch.testing.assert_close(
             compiled(GAMMA, LMBDA, **inputs),

@@ -20,6 +20,8 @@ __all__ = [
     "tree_backup_lambda_return_estimate",
 ]
 
+_MAX_BLOCKS = 16  # of a recurrence; fewer are more rounds over all steps, more are many small steps
+
 
 def retrace_lambda_return_estimate(
     gamma: float | Tensor,
@@ -71,8 +73,9 @@ def retrace_lambda_return_estimate(
         terminated (Tensor, optional): boolean end of episode, ``[*B, T, F]``. Defaults to ``done``.
 
     Keyword Args:
-        vectorized (bool): solve all ``T`` steps in ``log2(T)`` rounds of tensor operations.
-            ``False`` goes back one step at a time, with less memory. Defaults to ``True``.
+        vectorized (bool): go back in no more than 16 blocks of steps, which takes a few rounds of
+            tensor operations on all steps first. ``False`` goes back one step at a time, with less
+            memory. Defaults to ``True``.
         time_dim (int): the dimension of time, any but the last. Defaults to ``-2``.
 
     Returns:
@@ -360,7 +363,7 @@ def _one_step_cost(
         _check_shape(name, tensor, cost.shape, "that of cost")
     _check_boolean("terminated", terminated)
     gamma = _coefficient("gamma", gamma, cost.shape)
-    return cost + gamma * next_action_value.masked_fill(terminated, 0)
+    return cost + gamma * torch.where(terminated, 0, next_action_value)
 
 
 def _log_ratio(log_pi: Tensor, log_mu: Tensor, reward: Tensor) -> Tensor:
@@ -405,58 +408,58 @@ def _trace_return_estimate(
         log_trace, action_value, next_state_value, reward = (
             tensor.float() for tensor in (log_trace, action_value, next_state_value, reward)
         )
-    target = reward + gamma * next_state_value.masked_fill(terminated, 0)
+    target = reward + gamma * torch.where(terminated, 0, next_state_value)
     decay = gamma * lmbda
     if isinstance(decay, Tensor) and decay.ndim:
-        decay = decay.expand(shape).movedim(time_dim, -1)[..., :-1]
+        decay = decay.expand(shape).movedim(time_dim, 0)[:-1]
     log_trace, action_value, target, done = (
-        tensor.movedim(time_dim, -1) for tensor in (log_trace, action_value, target, done)
+        tensor.movedim(time_dim, 0) for tensor in (log_trace, action_value, target, done)
     )
     # Across a cut the ratio is another trajectory's: masking it before the exponential stops its
     # gradient too, and a NaN in either.
-    trace = log_trace[..., 1:].masked_fill(done[..., :-1], -torch.inf).exp() * decay
-    head = torch.addcmul(target[..., :-1], trace, action_value[..., 1:], value=-1)
-    delta = torch.cat([head, target[..., -1:]], -1)
-    solve = _solve_recurrence if vectorized else _loop_recurrence
-    return solve(trace, delta).movedim(-1, time_dim).to(dtype)
+    trace = torch.where(done[:-1], -torch.inf, log_trace[1:]).exp() * decay
+    head = torch.addcmul(target[:-1], trace, action_value[1:], value=-1)
+    solution = _solve_recurrence(trace, torch.cat([head, target[-1:]]), vectorized)
+    return solution.movedim(0, time_dim).contiguous().to(dtype)
 
 
-def _solve_recurrence(coefficient: Tensor, delta: Tensor) -> Tensor:
+def _solve_recurrence(coefficient: Tensor, delta: Tensor, vectorized: bool) -> Tensor:
     """Solve ``x[t] = delta[t] + coefficient[t] * x[t + 1]``, ``x[T - 1] = delta[T - 1]``.
 
-    By doubling: after each round ``delta[t]`` sums twice as many steps, and ``coefficient[t]`` is
-    the product of as many coefficients. There is no division, so coefficients of zero are harmless.
-    Zeros behind the last step spare every round a special case for its end.
+    By doubling: after each round ``delta[t]`` sums twice as many steps, ``coefficient[t]`` is the
+    product of as many coefficients, and ``x[t]`` depends on ``x`` as many steps later. Blocks of
+    that many steps then follow each other backwards in time. There is no division, so coefficients
+    of zero are harmless. Zeros behind the last step spare every round a special case for its end.
 
     Args:
-        coefficient (Tensor): ``[..., T - 1]``.
-        delta (Tensor): ``[..., T]``.
+        coefficient (Tensor): ``[T - 1, ...]``.
+        delta (Tensor): ``[T, ...]``.
+        vectorized (bool): leave no more than ``_MAX_BLOCKS`` blocks, otherwise one per step.
 
     Returns:
-        Tensor: ``x``, ``[..., T]``.
+        Tensor: ``x``, ``[T, ...]``.
 
     """
-    steps = delta.shape[-1]
-    rounds = (steps - 1).bit_length()
-    length = steps - 1 + 2**rounds
-    coefficient = torch.nn.functional.pad(coefficient, (0, length - steps + 1))
-    delta = torch.nn.functional.pad(delta, (0, length - steps))
-    for stride in (2**i for i in range(rounds)):
-        length -= stride
-        head = coefficient.narrow(-1, 0, length)
-        delta = torch.addcmul(delta.narrow(-1, 0, length), head, delta.narrow(-1, stride, length))
-        if length > steps:
-            coefficient = head * coefficient.narrow(-1, stride, length)
-    return delta
-
-
-def _loop_recurrence(coefficient: Tensor, delta: Tensor) -> Tensor:
-    """The same, one step after the other."""
-    *head, last = delta.unbind(-1)
-    solution = [last]
-    for factor, term in zip(reversed(coefficient.unbind(-1)), reversed(head), strict=True):
-        solution.append(torch.addcmul(term, factor, solution[-1]))
-    return torch.stack(solution[::-1], -1)
+    steps = len(delta)
+    block, strides = 1, []
+    while vectorized and block * _MAX_BLOCKS < steps:
+        strides.append(block)
+        block *= 2
+    padding = -steps % block + block
+    zeros = delta.new_zeros(padding, *delta.shape[1:])
+    coefficient = torch.cat([coefficient, zeros])
+    delta = torch.cat([delta, zeros[1:]])
+    for stride in strides:
+        head = coefficient[:-stride]
+        delta = torch.addcmul(delta[:-stride], head, delta[stride:])
+        coefficient = head * coefficient[stride:]
+    *terms, following = delta.split(block)
+    *factors, _ = coefficient.split(block)
+    solution = [following[: (steps - 1) % block + 1]]
+    for factor, term in zip(reversed(factors), reversed(terms), strict=True):
+        following = torch.addcmul(term, factor, following)
+        solution.append(following)
+    return torch.cat(solution[::-1])
 
 
 def _coefficient(name: str, value: float | Tensor, shape: Sequence[int]) -> float | Tensor:
@@ -477,7 +480,7 @@ def _coefficient(name: str, value: float | Tensor, shape: Sequence[int]) -> floa
 
 
 def _check_shape(name: str, tensor: Tensor, expected: Sequence[int], origin: str) -> None:
-    if tuple(tensor.shape) != tuple(expected):
+    if tensor.shape != tuple(expected):
         raise ValueError(
             f"{name} must have shape {tuple(expected)}, {origin}, got {tuple(tensor.shape)}."
         )

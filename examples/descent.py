@@ -38,14 +38,15 @@ class Descent:
     def step(self, losses: TensorDictBase) -> None:
         """One step down the sum of what is called ``loss_*``."""
         terms = {name: loss for name, loss in losses.items() if name.startswith("loss_")}
-        self.optim.zero_grad()
-        sum(terms.values()).backward()
-        norm = nn.utils.clip_grad_norm_(self._params, self._max_norm)
-        skip = norm.isfinite().logical_not().to(self._skipped.dtype)
-        # Where it is 1, a fused optimizer leaves all as it is: torch.amp.GradScaler relies on it.
-        self.optim.found_inf = skip
-        self.optim.step()
-        self.optim.zero_grad()
+        try:
+            sum(terms.values()).backward()
+            norm = nn.utils.clip_grad_norm_(self._params, self._max_norm)
+            skip = norm.isfinite().logical_not().to(self._skipped.dtype)
+            # Where it is 1, a fused optimizer leaves all as it is, as torch.amp.GradScaler expects.
+            self.optim.found_inf = skip
+            self.optim.step()
+        finally:
+            self.optim.zero_grad()
         self._skipped += skip
         for name, value in {"gradient norm": norm, **terms}.items():
             bad = self._bad.setdefault(name, torch.zeros_like(norm))

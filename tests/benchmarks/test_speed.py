@@ -72,12 +72,20 @@ def test_time_is_the_innermost_parts():
     replay = event("replay", 30, 5, critics)
     index = event("aten::index", 25, 10, replay)
     copy = event("aten::copy_", 15, 15, index)
-    product = event("aten::mm", 50, 50, event("AddmmBackward0", 50, 0, critics))
+    backward = event("AddmmBackward0", 50, 0, critics)
+    product = event("aten::mm", 50, 50, backward)
     collect = event("collect", 40, 10)
     simulator = event(profile_training.SIMULATOR, 30, 30, collect)
-    total, kernels, physics = profile_training.attribute(
-        [critics, replay, index, copy, product, collect, simulator]
-    )
-    assert total == {"time/critics": 70, "replay": 30, "collect": 40}
-    assert kernels == {"time/critics": 50, "replay": 25}
-    assert physics == {"collect": 30}
+    fused = event("graph_0_cpp_fused_relu_1", 10, 10, collect)
+    events = [critics, replay, index, copy, backward, product, collect, simulator, fused]
+    assert profile_training.attribute(events, slowdown=0.0) == {
+        "time": {"time/critics": 70, "replay": 30, "collect": 40, None: 0},
+        "kernels": {"time/critics": 50, "replay": 25, "collect": 10},
+        "simulator": {"collect": 30},
+    }
+    # One microsecond per event, taken off the part and the kernel that it is inside of.
+    assert profile_training.attribute(events, slowdown=len(events)) == {
+        "time": {"time/critics": 67, "replay": 28, "collect": 38, None: -2},
+        "kernels": {"time/critics": 50, "replay": 24, "collect": 10},
+        "simulator": {"collect": 30},
+    }

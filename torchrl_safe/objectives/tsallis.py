@@ -293,7 +293,7 @@ class TsallisLoss(SACLoss):
             self.qvalue_network_params,
         )
         prediction = prediction.get(self.tensor_keys.state_action_value).squeeze(-1)
-        td_error = (prediction - target).abs().detach().max(0)[0]
+        td_error = (prediction.detach() - target).abs().max(0)[0]
         loss = distance_loss(prediction, target.expand_as(prediction), self.loss_function).sum(0)
         loss = self._reduce_loss(loss, tensordict=tensordict, weights=weights)
         return loss, {"td_error": td_error}

@@ -88,6 +88,12 @@ def make_collector(
     return _AsyncCollector(creators, policy, **options)
 
 
+def envs_per_batch(cfg: DictConfig) -> int:
+    """How many environments a batch of :func:`make_collector` is of."""
+    shared = cfg.collector.backend == "multi_async"
+    return cfg.env.num_envs // (cfg.collector.num_workers if shared else 1)
+
+
 class ResumableCollector(Collector):
     """A collector whose state holds its environment's: loaded, it goes on with the next step.
 
@@ -152,9 +158,8 @@ class _Watched:
             which = ", ".join(f"worker {i} ({how})" for i, how in dead.items())
             raise WorkerDied(
                 f"of the collector.num_workers={self.num_workers}, "
-                f"{which} died, and the run stopped. A system out of memory kills: then lower "
-                "env.num_envs or collector.num_workers. Go on with the same command and "
-                "resume=true."
+                f"{which} died, and the run stopped. A system out of memory kills: then start "
+                "fewer. Go on with the same command and resume=true."
             ) from error
 
 

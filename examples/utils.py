@@ -23,7 +23,7 @@ from typing import Any
 
 import torch
 from checkpoints import adapter_of, latest, load_component, remove_leftovers, write_atomically
-from collectors import WorkerDied, make_collector
+from collectors import WorkerDied, envs_per_batch, make_collector
 from config import check_config
 from omegaconf import DictConfig, OmegaConf
 from tensordict import TensorDictBase
@@ -31,6 +31,7 @@ from torch import nn
 from torchrl._utils import logger as torchrl_logger
 from torchrl._utils import timeit
 from torchrl.checkpoint import Checkpoint, CheckpointRotation, GlobalRNGState
+from torchrl.collectors import BaseCollector
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType
 from torchrl.modules import MLP, ValueOperator
@@ -154,7 +155,7 @@ def train(
     )
     timeit.erase()  # what was timed before is not the run's
     started = time.perf_counter()
-    with GracefulStop() as stop, run.saved_if_a_worker_dies():
+    with GracefulStop() as stop, closing_down(collector), run.saved_if_a_worker_dies():
         # None is left of a run that was killed in its final evaluation.
         for batch in collector if run.frames_left else ():
             run.counters["frames"] += batch.numel()
@@ -186,21 +187,28 @@ def train(
                 cv=f"{metrics['train/cv_rate']:.4f}",
                 kl=f"{metrics.get('update/kl', 0.0):.4f}",
             )
-            if run.frames >= next_save or stop.requested:
+            if run.frames >= next_save:
                 next_save += cfg.checkpoint.interval
                 run.save()
             if stop.requested:
                 break
-    progress.close()
-    if not stop.requested:
         run.save()
-    collector.shutdown()
+    progress.close()
     if stop.requested:
         print(f"stopped at {run.frames} frames; go on with the same command and resume=true")
         return
     final_env = make_env(cfg, cfg.eval.final_episodes, EVAL_SEED)
     run.finish(final_env, policy)
     final_env.close()
+
+
+@contextmanager
+def closing_down(collector: BaseCollector) -> Iterator[None]:
+    """However it ends: a process waits for those that it has started before it exits."""
+    try:
+        yield
+    finally:
+        collector.shutdown()
 
 
 @contextmanager
@@ -270,7 +278,8 @@ class Run:
 
         Raises:
             CheckpointError: if the checkpoint is not what was written, or could run code.
-            ValueError: if the run to resume has all of its frames and its results.
+            ValueError: if the run to resume has all of its frames and its results, or has replayed
+                batches of another number of environments.
         """
         cfg = self.cfg
         self._register(**components)
@@ -278,6 +287,8 @@ class Run:
             remove_leftovers(self.path)
             checkpoint = latest(self.path)
             if checkpoint is not None:
+                if "buffer" in self.checkpoint.components:
+                    self._check_width()
                 self.checkpoint.load(checkpoint)
                 self._saved = self.frames
             if not self.frames_left and (self.path / "results.json").exists():
@@ -306,6 +317,18 @@ class Run:
     def frames_left(self) -> int:
         """Frames that the configuration still asks for."""
         return max(0, self.cfg.collector.total_frames - self.frames)
+
+    def _check_width(self) -> None:
+        """The replay buffer has a column for every environment of a batch."""
+        saved, new = (
+            envs_per_batch(cfg) for cfg in (OmegaConf.load(self.path / "config.yaml"), self.cfg)
+        )
+        if saved != new:
+            raise ValueError(
+                f"run_dir={self.cfg.run_dir} has replayed batches of {saved} environments and "
+                f"cannot go on with batches of {new}: leave env.num_envs as it was, with "
+                "collector.backend=multi_async env.num_envs / collector.num_workers."
+            )
 
     def _register(self, **components: Any) -> None:
         for name, component in components.items():

@@ -103,8 +103,7 @@ def test_a_killed_worker(tmp_path, monkeypatch, patience, backend):
     assert not multiprocessing.active_children()
     assert not any(Path(f"/proc/{pid}").exists() for pid in workers)  # not even as zombies
 
-    # Nothing is lost: it goes on, with fewer workers if need be. A batch of multi_async is one
-    # worker's, so that the replay's width is theirs, and their number stays.
+    # Nothing is lost: it goes on, with fewer workers. A batch of multi_async is one worker's.
     saved = int(checkpoints.latest(run_dir).name.split("-")[1])
     assert saved >= 2 * tiny.FRAMES
     monkeypatch.setattr(utils, "count_violations", count)
@@ -113,13 +112,51 @@ def test_a_killed_worker(tmp_path, monkeypatch, patience, backend):
         LONG,
         f"collector.total_frames={saved + tiny.FRAMES}",
         f"collector.backend={backend}",
-        f"collector.num_workers={1 if backend == 'multi_sync' else 2}",
+        "collector.num_workers=1",
+        f"env.num_envs={4 if backend == 'multi_sync' else 2}",
         "resume=true",
     )
     # The update during which it died is not logged, but what it had counted is not lost.
     counts = logged(run_dir)
     assert counts[0] == PER_BATCH
     assert counts[-1] == PER_BATCH * (saved // tiny.FRAMES + 1)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("backend", ["multi_sync", "multi_async"])
+def test_an_error_ends_the_workers(tmp_path, monkeypatch, patience, backend):
+    """An update that raises, as on a full disk: the process would wait for them for ever."""
+
+    def fail(batch):
+        patience()
+        assert len(multiprocessing.active_children()) == 2
+        raise OSError("no space left")
+
+    monkeypatch.setattr(utils, "batch_metrics", fail)
+    with pytest.raises(OSError, match="no space left") as info:
+        tiny.launch(tmp_path / "run", f"collector.backend={backend}")
+    assert not multiprocessing.active_children()
+    assert info.tb is not None  # nor is it for want of a traceback that would keep them
+
+
+@pytest.mark.parametrize(
+    ("overrides", "width"),
+    [
+        (["env.num_envs=2"], 2),
+        (["collector.backend=multi_sync", "env.num_envs=20"], 20),
+        (["collector.backend=multi_async"], 2),
+    ],
+)
+def test_resumed_with_other_environments(tmp_path, overrides, width):
+    run_dir = tmp_path / "run"
+    tiny.launch(run_dir, "collector.total_frames=100")
+    before = (run_dir / "config.yaml").read_text()
+    with pytest.raises(
+        ValueError, match=rf"batches of 4 environments .* batches of {width}: leave env.num_envs"
+    ):
+        tiny.launch(run_dir, "collector.total_frames=200", "resume=true", *overrides)
+    assert (run_dir / "config.yaml").read_text() == before
+    tiny.launch(run_dir, "collector.total_frames=200", "resume=true")
 
 
 @pytest.mark.long

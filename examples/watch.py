@@ -42,7 +42,8 @@ def look(run_dir: Path) -> str:
 
 def main(run_dir: Path, every: float, once: bool) -> None:
     """Look until interrupted."""
-    if not (run_dir / "log").is_dir():
+    config = run_dir / "config.yaml"
+    if not config.exists() or OmegaConf.load(config).logger.backend != "csv":
         raise FileNotFoundError(
             f"run_dir={run_dir} has no csv log: it is no run, or was started with another "
             "logger.backend."

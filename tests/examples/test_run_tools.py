@@ -111,6 +111,10 @@ def test_watch(run_dir, capsys):
 def test_watch_without_a_log(tmp_path):
     with pytest.raises(FileNotFoundError, match="no csv log"):
         watch.main(tmp_path, every=1.0, once=True)
+    (tmp_path / "log").mkdir()
+    (tmp_path / "config.yaml").write_text("logger: {backend: tensorboard}")
+    with pytest.raises(FileNotFoundError, match="another logger.backend"):
+        watch.main(tmp_path, every=1.0, once=True)
 
 
 def test_drive_from_what_is_not_there(tmp_path, monkeypatch):

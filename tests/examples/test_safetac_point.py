@@ -200,6 +200,26 @@ class TestReplay:
         assert losses[0].tolist() == [400, 800, 1200, 1600, 2000]
 
 
+def test_runs_side_by_side(tmp_path):
+    """A sweep from the command line: every run has its folder, its seed and its results."""
+    more = ["collector.total_frames=400", "seed=0,1", "run_dir=runs/seed_${seed}"]
+    side_by_side = ["--multirun", "hydra/launcher=joblib", "hydra.launcher.n_jobs=2"]
+    result = subprocess.run(
+        [sys.executable, str(EXAMPLES / "safetac_point.py"), *side_by_side, *TINY, *more],
+        capture_output=True,
+        text=True,
+        timeout=300,
+        check=False,
+        cwd=tmp_path,
+    )
+    assert result.returncode == 0, result.stderr
+    runs = [tmp_path / "runs" / f"seed_{seed}" for seed in range(2)]
+    assert [OmegaConf.load(run / "config.yaml").seed for run in runs] == [0, 1]
+    first, second = (json.loads((run / "results.json").read_text()) for run in runs)
+    assert first["frames"] == second["frames"] == 400
+    assert first["eval/return"] != second["eval/return"]
+
+
 class TestLoggers:
     def test_tensorboard(self, tmp_path):
         launch(tmp_path / "run", "collector.total_frames=400", "logger.backend=tensorboard")

@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule
-from torch.func import functional_call
+from tensordict.utils import NestedKey, unravel_key
 from torchrl.objectives.utils import _vmap_func
 
 Ensemble = Callable[[TensorDictBase, TensorDictBase], Any]
@@ -32,21 +32,20 @@ def ensemble(module: TensorDictModule, *, randomness: str, deactivate_vmap: bool
     """
     if not deactivate_vmap:
         return _vmap_func(module, (None, 0), randomness=randomness)
+    places = _places(module)
 
     def call(tensordict: TensorDictBase, params: TensorDictBase) -> TensorDictBase:
-        members = {
-            name if isinstance(name, str) else ".".join(name): stacked.unbind(0)
-            for name, stacked in params.items(True, True)
-        }
-        outputs = [
-            functional_call(
-                module,
-                dict(zip(members, member, strict=True)),
-                (tensordict.copy(),),
-                tie_weights=False,  # they come with every name
-            )
-            for member in zip(*members.values(), strict=True)
-        ]
+        leaves = [(*places[key], leaf.unbind(0)) for key, leaf in params.items(True, True)]
+        own = [registry[name] for registry, name, _ in leaves]
+        outputs = []
+        try:
+            for i in range(len(params)):
+                for registry, name, members in leaves:
+                    registry[name] = members[i]
+                outputs.append(module(tensordict.copy()))
+        finally:
+            for (registry, name, _), tensor in zip(leaves, own, strict=True):
+                registry[name] = tensor
         batch_size = (len(outputs), *tensordict.batch_size)
         out = TensorDict(batch_size=batch_size, device=tensordict.device)
         for key in module.out_keys:
@@ -54,3 +53,17 @@ def ensemble(module: TensorDictModule, *, randomness: str, deactivate_vmap: bool
         return out
 
     return call
+
+
+def _places(module: TensorDictModule) -> dict[NestedKey, tuple[dict[str, Any], str]]:
+    """Where a module keeps its parameters and buffers, by their keys in a tensordict.
+
+    To put tensors there is what :func:`torch.func.functional_call` does, too, after it has looked
+    for the place by its name, parameter by parameter and call by call.
+    """
+    return {
+        unravel_key((*path.split("."), name) if path else (name,)): (registry, name)
+        for path, owner in module.named_modules(remove_duplicate=False)
+        for registry in (owner._parameters, owner._buffers)
+        for name in registry
+    }

@@ -45,7 +45,7 @@ PARTS = {
     "time/critics": "critics: gradient steps",
     "time/policy": "trust-region step",
 }
-UPDATE, SIMULATOR = "update", "simulator"
+SIMULATOR = "simulator"
 NUM_TIMED = 3  # updates without the profiler, after the warm-up
 
 

@@ -220,6 +220,7 @@ TINY = [
     *("collector.init_frames=0", "replay_buffer.size=2000", "replay_buffer.slice_len=10"),
     *("policy.num_cells=[8]", "critic.num_cells=[8]", "optim.critic_rounds=1"),
     *("optim.critic_frames=100", "optim.minibatch_size=100", "optim.policy_frames=50"),
+    "optim.compile=false",  # not everywhere is a compiler
 ]
 
 
@@ -229,7 +230,7 @@ def tiny_arguments(part: Part) -> list[str]:
         return ["--benchmark-max-time=0.01", "--benchmark-warmup=off", "-k", TINY_BENCHMARKS]
     if "bench_faces" in part.command:
         return ["point", "--rounds", "1", "--seconds", "0.01"]
-    return [*TINY, "optim.compile=false"]  # not everywhere is a compiler
+    return TINY
 
 
 def main() -> None:

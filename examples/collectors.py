@@ -158,8 +158,8 @@ class _Watched:
             which = ", ".join(f"worker {i} ({how})" for i, how in dead.items())
             raise WorkerDied(
                 f"of the collector.num_workers={self.num_workers}, "
-                f"{which} died, and the run stopped. A system out of memory kills: then start "
-                "fewer. Go on with the same command and resume=true."
+                f"{which} died, and the run stopped. A system out of memory kills: then lower "
+                "collector.num_workers. Go on with the same command and resume=true."
             ) from error
 
 

@@ -136,7 +136,8 @@ def test_an_error_ends_the_workers(tmp_path, monkeypatch, patience, backend):
     with pytest.raises(OSError, match="no space left") as info:
         tiny.launch(tmp_path / "run", f"collector.backend={backend}")
     assert not multiprocessing.active_children()
-    assert info.tb is not None  # nor is it for want of a traceback that would keep them
+    # An error that is kept, as hydra keeps it, keeps the collector: nothing else would end them.
+    assert info.tb is not None
 
 
 @pytest.mark.parametrize(

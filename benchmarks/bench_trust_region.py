@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from typing import Any
 
 import pytest
@@ -26,6 +26,7 @@ from torchrl_safe.optim.curvature import (
     gradient,
     hessian_product,
 )
+from torchrl_safe.optim.repetition import CudaGraphRepeat, Repeat, one_by_one
 
 NUM_STATES = 5000
 CG_ITERS = 10
@@ -86,26 +87,40 @@ def make_solver(width: int, device: str, curvature: str) -> Callable[[], Tensor]
     """Conjugate gradients for g and b, from the closure's outputs to both solutions."""
     cfg, policy, states, closure_of = make_closures(width, device)
     params = list(policy.parameters())
-    out = closure_of(NUM_STATES // 4)()
-    old = out["statistics"].detach().clone()
-    outputs = [out["objective"], out["constraint"].squeeze()]
-    rhs = torch.stack([flatten(gradient("g, b", [output], params)) for output in outputs])
+    repeat: Repeat = one_by_one
+    stream: Callable[[], AbstractContextManager[None]] = nullcontext
+    if curvature == "gauss_newton_cuda_graph":
+        repeat = CudaGraphRepeat(torch.device(device))
+        stream = repeat.stream
+    with stream():
+        out = closure_of(NUM_STATES // 4)()
+        old = out["statistics"].detach().clone()
+        outputs = [out["objective"], out["constraint"].squeeze()]
+        rhs = torch.stack([flatten(gradient("g, b", [output], params)) for output in outputs])
 
     def make_product() -> Product:
-        if curvature == "gauss_newton":
-            return gauss_newton_product(out["statistics"], moment_kl, params)
         if curvature == "gauss_newton_quarter":
             return gauss_newton_product(out["curvature_statistics"], moment_kl, params)
+        if curvature.startswith("gauss_newton"):
+            return gauss_newton_product(out["statistics"], moment_kl, params)
         if curvature == "double_backward":
             return hessian_product(moment_kl(old, out["statistics"]), params)
         return rebuilt_hessian_product(policy, states)
 
     def solve() -> Tensor:
-        product = make_product()
         damping = cfg.optim.damping
-        return conjugate_gradient(lambda v: product(v) + damping * v, rhs, CG_ITERS).solution
+        with stream():
+            product = make_product()
+            return conjugate_gradient(
+                lambda v: product(v) + damping * v, rhs, CG_ITERS, repeat=repeat
+            ).solution
 
     return solve
+
+
+def skip_if_for_gpu(curvature: str, device: str) -> None:
+    if curvature.endswith("cuda_graph") and device == "cpu":
+        pytest.skip("a CUDA graph is a GPU's")
 
 
 @contextmanager
@@ -120,13 +135,20 @@ def double_precision() -> Iterator[None]:
 
 @pytest.mark.parametrize(
     "curvature",
-    ["gauss_newton", "gauss_newton_quarter", "double_backward", "double_backward_rebuilt"],
+    [
+        "gauss_newton",
+        "gauss_newton_cuda_graph",
+        "gauss_newton_quarter",
+        "double_backward",
+        "double_backward_rebuilt",
+    ],
 )
 @pytest.mark.parametrize("width", [128, 512], ids="24-{0}-{0}".format)
 def bench_natural_gradients(
     benchmark: Any, device: str, timed: Any, width: int, curvature: str
 ) -> None:
     """The part of a step that solves two systems; directions are compared in double precision."""
+    skip_if_for_gpu(curvature, device)
     benchmark.group = f"natural gradients of g and b, 24-{width}-{width}, {NUM_STATES} states"
     solve = make_solver(width, device, curvature)
     benchmark.pedantic(timed(solve), rounds=3, warmup_rounds=1)
@@ -139,10 +161,14 @@ def bench_natural_gradients(
     assert cosine > (0.8 if curvature == "gauss_newton_quarter" else 0.9999)
 
 
-@pytest.mark.parametrize("curvature", ["gauss_newton", "gauss_newton_quarter", "double_backward"])
+@pytest.mark.parametrize(
+    "curvature",
+    ["gauss_newton", "gauss_newton_cuda_graph", "gauss_newton_quarter", "double_backward"],
+)
 @pytest.mark.parametrize("width", [128, 512], ids="24-{0}-{0}".format)
 def bench_step(benchmark: Any, device: str, timed: Any, width: int, curvature: str) -> None:
     """One step from the same weights on the same states, line search included."""
+    skip_if_for_gpu(curvature, device)
     benchmark.group = f"trust-region step, 24-{width}-{width}, 5 Gaussians, {NUM_STATES} states"
     cfg, policy, _, closure_of = make_closures(width, device)
     optim = TrustRegionSafeOptimizer(
@@ -151,6 +177,7 @@ def bench_step(benchmark: Any, device: str, timed: Any, width: int, curvature: s
         damping=cfg.optim.damping,
         cg_iters=CG_ITERS,
         statistics_kl=None if curvature == "double_backward" else moment_kl,
+        cuda_graph=curvature.endswith("cuda_graph"),
     )
     weights = [p.detach().clone() for p in policy.parameters()]
 

@@ -77,6 +77,7 @@ def make_trust_region(
         max_backtracks=cfg.optim.max_backtracks,
         recovery_ratio=cfg.optim.recovery_ratio,
         statistics_kl=distance.kl,
+        cuda_graph=cfg.optim.cuda_graphs and torch.device(cfg.device).type == "cuda",
     )
 
 

@@ -212,25 +212,73 @@ def test_host_does_not_wait_for_critics(device):
         update()
 
 
+def make_step(device: str, **settings) -> tuple[GMMTanhPolicy, Callable]:
+    """A policy, and a trust-region step of it."""
+    policy, reward_loss, cost_loss = make_blocks(device)
+    states = make_data().to(device).select("observation")
+    torch.manual_seed(3)
+    noise = policy.get_dist(states).draw_noise()
+    optim = TrustRegionSafeOptimizer(
+        policy.parameters(), max_kl=1e-4, statistics_kl=MOMENT_MATCHED.kl, **settings
+    )
+    closure = make_closure(policy, reward_loss, cost_loss, states, noise)
+    return policy, partial(optim.step, closure)
+
+
 @pytest.mark.parametrize("device", [GPU])
-def test_host_waits_for_the_line_search_alone(device):
+def test_a_step_as_a_graph_is_the_same(device):
+    """Step after step, whose graphs take over each other's memory."""
+    plain, plain_step = make_step(device)
+    graphed, graphed_step = make_step(device, cuda_graph=True)
+    held = []
+    for _ in range(4):
+        expected, actual = plain_step().to_dict(), graphed_step().to_dict()
+        assert actual == pytest.approx(expected, rel=1e-6, abs=1e-12)
+        for a, b in zip(plain.parameters(), graphed.parameters(), strict=True):
+            torch.testing.assert_close(b, a, rtol=1e-8, atol=1e-12)
+        held.append(torch.cuda.memory_reserved())
+    assert held[3] == held[1]
+
+
+@pytest.mark.parametrize("device", [GPU])
+def test_a_step_that_cannot_be_recorded_leaves_all_as_it_was(device):
+    """And the next one can."""
+
+    class Waits(torch.autograd.Function):
+        @staticmethod
+        def forward(ctx, x):
+            return x.clone()
+
+        @staticmethod
+        def backward(ctx, grad):
+            return grad * grad.isfinite().all().item()
+
+    policy, step = make_step(device, cuda_graph=True)
+    (closure,) = step.args
+    before = [p.detach().clone() for p in policy.parameters()]
+
+    def waits():
+        out = closure()
+        out["statistics", "mean"] = Waits.apply(out["statistics", "mean"])
+        return out
+
+    with pytest.raises(RuntimeError, match="captur"):
+        step.func(waits)
+    assert all(map(torch.equal, before, policy.parameters()))
+    assert step().accepted
+
+
+@pytest.mark.parametrize("cuda_graph", [False, True])
+@pytest.mark.parametrize("device", [GPU])
+def test_host_waits_for_the_line_search_alone(device, cuda_graph):
     """As often after twenty conjugate-gradient iterations as after two."""
     waits = {}
     for iterations in (2, 20):
-        policy, reward_loss, cost_loss = make_blocks(device)
-        states = make_data().to(device).select("observation")
-        noise = policy.get_dist(states).draw_noise()
-        optim = TrustRegionSafeOptimizer(
-            policy.parameters(),
-            max_kl=1e-4,
-            cg_iters=iterations,
-            statistics_kl=MOMENT_MATCHED.kl,
-        )
-        closure = make_closure(policy, reward_loss, cost_loss, states, noise)
-        optim.step(closure)
+        _, step = make_step(device, cg_iters=iterations, cuda_graph=cuda_graph)
+        step()
         with sync_debug_mode("warn"), warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
-            report = optim.step(closure)
+            report = step()
         candidates = report.backtracks + 1
         waits[iterations] = len([w for w in caught if "synchroniz" in str(w.message)]), candidates
     assert waits[2] == waits[20], waits

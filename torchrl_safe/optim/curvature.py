@@ -9,6 +9,8 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
+from torchrl_safe.optim.repetition import Repeat, State, one_by_one
+
 Statistics: TypeAlias = Tensor | TensorDictBase
 StatisticsKL: TypeAlias = Callable[[Statistics, Statistics], Tensor]
 Product: TypeAlias = Callable[[Tensor], Tensor]
@@ -173,7 +175,11 @@ class ConjugateGradient(NamedTuple):
 
 
 def conjugate_gradient(
-    product: Product, rhs: Tensor, iterations: int, tolerance: float = 1e-10
+    product: Product,
+    rhs: Tensor,
+    iterations: int,
+    tolerance: float = 1e-10,
+    repeat: Repeat = one_by_one,
 ) -> ConjugateGradient:
     """Solves ``H x = rhs`` for k right-hand sides side by side, H symmetric positive definite.
 
@@ -185,6 +191,8 @@ def conjugate_gradient(
         rhs (torch.Tensor): shape [k, n].
         iterations (int): products at most.
         tolerance (float): residual norm at which a system counts as solved, relative to ``rhs``.
+        repeat (callable): runs the iterations. Defaults to
+            :func:`~torchrl_safe.optim.repetition.one_by_one`.
 
     Returns:
         ConjugateGradient: ``solution``, ``residual``, ``relative_residual`` and ``negative``.
@@ -198,24 +206,34 @@ def conjugate_gradient(
     scale = rhs.abs().amax(-1, keepdim=True)
     scale = torch.where(scale > 0, scale, torch.ones_like(scale))
     residual = rhs / scale
-    solution, direction = torch.zeros_like(rhs), residual
     norm = residual.square().sum(-1, keepdim=True)
     start, target = norm.sqrt(), tolerance**2 * norm
     active = norm > target
-    negative = torch.zeros_like(active)
     eps = torch.finfo(rhs.dtype).eps
-    for _ in range(iterations):
+
+    def iteration(
+        solution: Tensor,
+        residual: Tensor,
+        direction: Tensor,
+        norm: Tensor,
+        active: Tensor,
+        negative: Tensor,
+    ) -> State:
         curved = product(direction)
         curvature = (direction * curved).sum(-1, keepdim=True)
         size = direction.norm(dim=-1, keepdim=True) * curved.norm(dim=-1, keepdim=True)
         active = active & (norm > target)
-        negative |= active & (curvature < -(eps**0.5) * size)
+        negative = negative | active & (curvature < -(eps**0.5) * size)
         active = active & (curvature > eps * size)
         length = torch.where(active, norm / curvature, 0.0)
         solution = solution + length * direction
         residual = residual - length * curved
         previous, norm = norm, residual.square().sum(-1, keepdim=True)
         direction = residual + torch.where(active, norm / previous, 0.0) * direction
+        return solution, residual, direction, norm, active, negative
+
+    begin = torch.zeros_like(rhs), residual, residual, norm, active, torch.zeros_like(active)
+    solution, residual, _, norm, _, negative = repeat(iteration, begin, iterations)
     relative = norm.sqrt() / torch.where(start > 0, start, 1.0)
     return ConjugateGradient(
         solution * scale, residual * scale, relative.squeeze(-1), negative.squeeze(-1)

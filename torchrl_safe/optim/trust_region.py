@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable
+from contextlib import nullcontext
 from dataclasses import dataclass
+from functools import cached_property
 from numbers import Integral, Real
 from typing import Any, NamedTuple, TypeAlias
 
@@ -25,6 +27,7 @@ from torchrl_safe.optim.curvature import (
     hessian_product,
     unflatten,
 )
+from torchrl_safe.optim.repetition import CudaGraphRepeat, one_by_one
 from torchrl_safe.optim.subproblem import MAX_CONSTRAINTS, solve_subproblem
 
 __all__ = ["TrustRegionReport", "TrustRegionSafeOptimizer"]
@@ -185,6 +188,10 @@ class TrustRegionSafeOptimizer(torch.optim.Optimizer):
             once gives CPO's pure recovery step. Defaults to 1.0.
         statistics_kl (callable, optional): from old and new statistics to their mean KL, a scalar,
             twice differentiable in the new ones.
+        cuda_graph (bool): whether conjugate gradients run as a CUDA graph, on a stream of their
+            own together with the closure: on a GPU their many small kernels wait for Python
+            otherwise. Backward passes through the closure's result must not make the host wait,
+            as those of the blocks here do not. Defaults to ``False``.
 
     ``max_kl``, ``damping``, ``backtrack_ratio``, ``max_backtracks``, ``cg_iters`` and
     ``recovery_ratio`` live in ``param_groups[0]`` and may be scheduled there.
@@ -192,7 +199,8 @@ class TrustRegionSafeOptimizer(torch.optim.Optimizer):
     Raises:
         TypeError: if ``statistics_kl`` is not callable.
         ValueError: if an argument is out of its range, or the parameters are not floating point,
-            differ in dtype or device, or come in several groups.
+            differ in dtype or device, come in several groups, or are not on a CUDA device with
+            ``cuda_graph``.
 
     Examples:
         >>> import torch
@@ -225,10 +233,14 @@ class TrustRegionSafeOptimizer(torch.optim.Optimizer):
         max_backtracks: int = 10,
         recovery_ratio: float = 1.0,
         statistics_kl: StatisticsKL | None = None,
+        cuda_graph: bool = False,
     ) -> None:
         if statistics_kl is not None and not callable(statistics_kl):
             raise TypeError(f"statistics_kl must be callable or None, got {statistics_kl!r}.")
+        if not isinstance(cuda_graph, bool):
+            raise TypeError(f"cuda_graph must be True or False, got {cuda_graph!r}.")
         self.statistics_kl = statistics_kl
+        self.cuda_graph = cuda_graph
         defaults = {
             "max_kl": max_kl,
             "damping": damping,
@@ -241,7 +253,12 @@ class TrustRegionSafeOptimizer(torch.optim.Optimizer):
         super().__init__(params, defaults)
 
     def __getstate__(self) -> dict[str, Any]:
-        return {**super().__getstate__(), "statistics_kl": self.statistics_kl}
+        kept = {"statistics_kl": self.statistics_kl, "cuda_graph": self.cuda_graph}
+        return super().__getstate__() | kept
+
+    @cached_property
+    def _graphs(self) -> CudaGraphRepeat:
+        return CudaGraphRepeat(self.param_groups[0]["params"][0].device)
 
     def add_param_group(self, param_group: dict[str, Any]) -> None:
         """Take the one group of parameters; a second one is a ``ValueError``."""
@@ -249,7 +266,7 @@ class TrustRegionSafeOptimizer(torch.optim.Optimizer):
             raise ValueError("params must be one group, got several: a trust region has one size.")
         _check_settings({**self.defaults, **param_group})
         super().add_param_group(param_group)
-        _check_params(self.param_groups[0]["params"])
+        self._check_params(self.param_groups[0]["params"])
 
     def step(self, closure: Closure) -> TrustRegionReport:  # type: ignore[override]
         """Take one step.
@@ -275,10 +292,11 @@ class TrustRegionSafeOptimizer(torch.optim.Optimizer):
         params = [p for p in settings["params"] if p.requires_grad]
         if not params:
             raise ValueError("params must hold one that requires a gradient, got none that does.")
-        _check_params(params)
+        self._check_params(params)
         backup = [p.detach().clone() for p in params]
         try:
-            report = self._step(closure, params, backup, settings)
+            with self._graphs.stream() if self.cuda_graph else nullcontext():
+                report = self._step(closure, params, backup, settings)
         except BaseException:
             _move(params, backup)
             raise
@@ -360,7 +378,10 @@ class TrustRegionSafeOptimizer(torch.optim.Optimizer):
         gradients = _gradients(out, params)
         damping = settings["damping"]
         systems = conjugate_gradient(
-            lambda vectors: product(vectors) + damping * vectors, gradients, settings["cg_iters"]
+            lambda vectors: product(vectors) + damping * vectors,
+            gradients,
+            settings["cg_iters"],
+            repeat=self._graphs if self.cuda_graph else one_by_one,
         )
         residual = float(systems.relative_residual.max())
         # Double precision also keeps reduced-precision matrix products out of the subproblem.
@@ -394,6 +415,18 @@ class TrustRegionSafeOptimizer(torch.optim.Optimizer):
             tolerance=_TOLERANCE * np.sqrt(2 * settings["max_kl"] * np.diag(gram)[1:]),
             cg_residual=residual,
         )
+
+    def _check_params(self, params: list[Tensor]) -> None:
+        kinds = {(p.dtype, p.device) for p in params}
+        if len(kinds) != 1 or not params[0].is_floating_point():
+            raise ValueError(
+                "params must share one floating-point dtype and one device, got "
+                f"{sorted(f'{dtype} on {device}' for dtype, device in kinds)}."
+            )
+        if self.cuda_graph and not params[0].is_cuda:
+            raise ValueError(
+                f"cuda_graph=True needs params on a CUDA device, got {params[0].device}."
+            )
 
     def _call(self, closure: Closure) -> TensorDictBase:
         out = closure()
@@ -496,15 +529,6 @@ def _refusal(
 def _move(params: list[Tensor], values: list[Tensor] | tuple[Tensor, ...]) -> None:
     with torch.no_grad():
         torch._foreach_copy_(params, values)
-
-
-def _check_params(params: list[Tensor]) -> None:
-    kinds = {(p.dtype, p.device) for p in params}
-    if len(kinds) != 1 or not params[0].is_floating_point():
-        raise ValueError(
-            "params must share one floating-point dtype and one device, got "
-            f"{sorted(f'{dtype} on {device}' for dtype, device in kinds)}."
-        )
 
 
 def _check_settings(settings: dict[str, Any]) -> None:

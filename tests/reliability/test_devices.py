@@ -163,11 +163,13 @@ def test_numbers_are_those_of_the_cpu(device, distance):
     expected, actual = learn("cpu", distance), learn(device, distance)
     for name, value in expected.items():
         assert actual[name].device.type == device
+        # Conjugate gradients multiply the last digits by the curvature's condition.
+        loose = 100 if name.startswith("weight") else 1
         torch.testing.assert_close(
             actual[name].cpu(),
             value,
-            rtol=1e-8,
-            atol=1e-10,
+            rtol=loose * 1e-8,
+            atol=loose * 1e-10,
             msg=lambda text, name=name: f"{name}: {text}",
         )
 

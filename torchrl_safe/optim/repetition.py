@@ -37,9 +37,10 @@ def one_by_one(iteration: Iteration, state: State, times: int) -> State:
 class CudaGraphRepeat:
     """Repeats by launching the kernels of an iteration at once, which spares waiting for Python.
 
-    The first iteration is called, the second recorded, and the graph launched for it and the
-    others. Kernels of the default stream cannot be recorded, and those of a backward pass are on
-    the stream of the forward pass: all that an iteration differentiates must be computed inside
+    An iteration, which must return new tensors, is called once, while it is recorded, and the graph
+    launched ``times`` times.
+    Kernels of the default stream cannot be recorded, and those of a backward pass are on the stream
+    of the forward pass: all that an iteration differentiates must be computed inside
     :meth:`stream`.
 
     Args:
@@ -64,9 +65,10 @@ class CudaGraphRepeat:
 
     def __call__(self, iteration: Iteration, state: State, times: int) -> State:
         """See :func:`one_by_one`."""
-        if times < 3:  # recording costs as much as a call
-            return one_by_one(iteration, state, times)
-        state = iteration(*state)
+        first = self._graph is None
+        if first:  # what is settled once cannot be recorded
+            state = iteration(*state)
+        state = [tensor.clone() for tensor in state]
         graph = torch.cuda.CUDAGraph()
         # torch.cuda.graph would give all cached memory back to the driver before it begins.
         graph.capture_begin(pool=None if self._graph is None else self._graph.pool())
@@ -76,6 +78,6 @@ class CudaGraphRepeat:
         finally:
             graph.capture_end()
         self._graph = graph
-        for _ in range(times - 1):
+        for _ in range(times - first):
             graph.replay()
         return state

@@ -33,24 +33,29 @@ class Descent:
         self._max_norm = cfg.optim.get("max_grad_norm", math.inf)
         self._params = [param for group in optim.param_groups for param in group["params"]]
         self._skipped = torch.zeros((), device=self._params[0].device)
-        self._bad: dict[str, Tensor] = {}  # of the last step that was skipped
+        self._names: list[str] = []
+        self._bad: Tensor | None = None  # their values in the last step that was skipped
 
     def step(self, losses: TensorDictBase) -> None:
         """One step down the sum of what is called ``loss_*``."""
         terms = {name: loss for name, loss in losses.items() if name.startswith("loss_")}
         try:
-            sum(terms.values()).backward()
-            norm = nn.utils.clip_grad_norm_(self._params, self._max_norm)
+            torch.autograd.backward(list(terms.values()))
+            norm = nn.utils.get_total_norm(p.grad for p in self._params if p.grad is not None)
             skip = norm.isfinite().logical_not().to(self._skipped.dtype)
-            # Where it is 1, a fused optimizer leaves all as it is, as torch.amp.GradScaler expects.
+            # As torch.amp.GradScaler does it: a fused optimizer divides gradients by the one, and
+            # leaves all as it is where the other is 1. It reads both in single precision.
+            self.optim.grad_scale = (norm / self._max_norm).clamp(min=1).float()
             self.optim.found_inf = skip
             self.optim.step()
         finally:
             self.optim.zero_grad()
         self._skipped += skip
-        for name, value in {"gradient norm": norm, **terms}.items():
-            bad = self._bad.setdefault(name, torch.zeros_like(norm))
-            bad.copy_(torch.where(skip > 0, value.detach(), bad))
+        self._names = ["gradient norm", *terms]
+        values = torch.stack([norm, *terms.values()]).detach()
+        if self._bad is None:
+            self._bad = torch.zeros_like(values)
+        self._bad.copy_(torch.where(skip > 0, values, self._bad))  # in place: a graph's memory
 
     def count(self) -> float:
         """Steps that were skipped since it was last asked.
@@ -61,7 +66,7 @@ class Descent:
         skipped = self._skipped.item()
         self._skipped.zero_()
         if skipped > self._max_skipped:
-            bad = {name: value.item() for name, value in self._bad.items()}
+            bad = dict(zip(self._names, self._bad.tolist(), strict=True))
             raise FloatingPointError(
                 f"{skipped:.0f} gradient steps were not finite, more than "
                 f"optim.max_skipped={self._max_skipped}: gradient norm "

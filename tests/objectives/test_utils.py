@@ -7,6 +7,7 @@ import torch
 from tensordict import TensorDict, from_modules
 from tensordict.nn import TensorDictModule
 from torch import nn
+from torchrl.modules import ValueOperator
 
 from torchrl_safe.objectives.utils import ensemble
 
@@ -51,6 +52,38 @@ def test_outputs_are_those_of_the_members(count, deactivate_vmap):
         expected = member(data.clone())
         for key in member.out_keys:
             torch.testing.assert_close(out[key][i], expected[key], rtol=0, atol=1e-14)
+
+
+class _Critic(nn.Module):
+    """Names of its arguments are in another order than those of the keys."""
+
+    def __init__(self):
+        super().__init__()
+        self.net = nn.Linear(5, 1).double()
+
+    def forward(self, state, action):
+        return self.net(torch.cat([state, action.exp()], -1))
+
+
+@pytest.mark.parametrize(
+    "in_keys",
+    [["state", ("agent", "action")], {"action": ("agent", "action"), "state": "state"}],
+    ids=["by_position", "by_name"],
+)
+def test_value_operators(in_keys):
+    members = [ValueOperator(_Critic(), in_keys=in_keys, out_keys=["value"]) for _ in range(2)]
+    data = TensorDict(
+        {"state": torch.randn(5, 3).double(), "agent": {"action": torch.randn(5, 2).double()}}, [5]
+    )
+    call = ensemble(
+        ValueOperator(_Critic(), in_keys=in_keys, out_keys=["value"]),
+        randomness="error",
+        deactivate_vmap=True,
+    )
+    out = call(data, from_modules(*members, as_module=True))
+    assert set(data.keys()) == {"state", "agent"}
+    for value, member in zip(out["value"], members, strict=True):
+        torch.testing.assert_close(value, member(data.clone())["value"], rtol=0, atol=1e-14)
 
 
 def test_gradients_are_those_of_the_members():

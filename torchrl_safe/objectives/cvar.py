@@ -12,6 +12,7 @@ from tensordict import TensorDict, TensorDictBase, TensorDictParams
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule, dispatch
 from tensordict.utils import NestedKey
 from torch import Tensor
+from torch.distributions import Distribution
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.modules.distributions.utils import sample_and_log_prob
 from torchrl.objectives import LossModule, distance_loss
@@ -362,17 +363,10 @@ class CVaRCostLoss(LossModule):
         action_value_key = getattr(estimator_keys, "state_action_value", "state_action_value")
         next_tensordict = tensordict.get("next")
         critics = (self.target_cost_network_params, self.target_std_network_params)
-        with (
-            torch.no_grad(),
-            set_exploration_type(ExplorationType.RANDOM),
-            self.target_actor_network_params.to_module(
-                self.actor_network, preserve_module_state=False
-            ),
-        ):
+        with torch.no_grad(), set_exploration_type(ExplorationType.RANDOM):
             next_action = next_tensordict.get("policy_action", None)
             if next_action is None:
-                next_dist = self.actor_network.get_dist(next_tensordict)
-                next_action, _ = sample_and_log_prob(next_dist)
+                next_action, _ = sample_and_log_prob(self._target_dist(next_tensordict))
             action = tensordict.get(keys.action)
             data = tensordict.select(
                 keys.log_prob,
@@ -390,7 +384,7 @@ class CVaRCostLoss(LossModule):
             if isinstance(estimator, RetraceEstimator):
                 log_prob = tensordict.get(estimator_keys.policy_log_prob, None)
                 if log_prob is None:
-                    log_prob = self.actor_network.get_dist(tensordict).log_prob(action)
+                    log_prob = self._target_dist(tensordict).log_prob(action)
                 data.set(estimator_keys.policy_log_prob, log_prob)
             cost = data.get(_next(keys.cost))
             terminated = data.get(_next(keys.terminated), data.get(_next(keys.done)))
@@ -505,6 +499,12 @@ class CVaRCostLoss(LossModule):
         elif level is not None:
             raise ValueError(f"level={level} needs the reference that it takes the place of.")
         return value - self.cost_limit
+
+    def _target_dist(self, tensordict: TensorDictBase) -> Distribution:
+        with self.target_actor_network_params.to_module(
+            self.actor_network, preserve_module_state=False
+        ):
+            return self.actor_network.get_dist(tensordict)
 
     def _predict(
         self,

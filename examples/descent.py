@@ -40,7 +40,7 @@ class Descent:
         """One step down the sum of what is called ``loss_*``."""
         terms = {name: loss for name, loss in losses.items() if name.startswith("loss_")}
         try:
-            torch.autograd.backward(list(terms.values()))
+            sum(terms.values()).backward()  # some may be constant
             norm = nn.utils.get_total_norm(p.grad for p in self._params if p.grad is not None)
             skip = norm.isfinite().logical_not().to(self._skipped.dtype)
             # As torch.amp.GradScaler does it: a fused optimizer divides gradients by the one, and

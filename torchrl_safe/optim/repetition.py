@@ -38,10 +38,9 @@ class CudaGraphRepeat:
     """Repeats by launching the kernels of an iteration at once, which spares waiting for Python.
 
     An iteration, which must return new tensors, is called once, while it is recorded, and the graph
-    launched ``times`` times.
-    Kernels of the default stream cannot be recorded, and those of a backward pass are on the stream
-    of the forward pass: all that an iteration differentiates must be computed inside
-    :meth:`stream`.
+    launched ``times`` times. Kernels of the default stream cannot be recorded, and those of a
+    backward pass are on the stream of the forward pass: this object is called inside
+    :meth:`stream`, and so is what computes all that an iteration differentiates.
 
     Args:
         device (torch.device): a CUDA device.

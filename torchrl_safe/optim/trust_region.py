@@ -197,7 +197,7 @@ class TrustRegionSafeOptimizer(torch.optim.Optimizer):
     ``recovery_ratio`` live in ``param_groups[0]`` and may be scheduled there.
 
     Raises:
-        TypeError: if ``statistics_kl`` is not callable.
+        TypeError: if ``statistics_kl`` is not callable, or ``cuda_graph`` not a bool.
         ValueError: if an argument is out of its range, or the parameters are not floating point,
             differ in dtype or device, come in several groups, or are not on a CUDA device with
             ``cuda_graph``.

@@ -118,11 +118,6 @@ def make_solver(width: int, device: str, curvature: str) -> Callable[[], Tensor]
     return solve
 
 
-def skip_if_for_gpu(curvature: str, device: str) -> None:
-    if curvature.endswith("cuda_graph") and device == "cpu":
-        pytest.skip("a CUDA graph is a GPU's")
-
-
 @contextmanager
 def double_precision() -> Iterator[None]:
     """For what is made inside: ten iterations amplify the last digits of single precision."""
@@ -148,7 +143,6 @@ def bench_natural_gradients(
     benchmark: Any, device: str, timed: Any, width: int, curvature: str
 ) -> None:
     """The part of a step that solves two systems; directions are compared in double precision."""
-    skip_if_for_gpu(curvature, device)
     benchmark.group = f"natural gradients of g and b, 24-{width}-{width}, {NUM_STATES} states"
     solve = make_solver(width, device, curvature)
     benchmark.pedantic(timed(solve), rounds=3, warmup_rounds=1)
@@ -168,7 +162,6 @@ def bench_natural_gradients(
 @pytest.mark.parametrize("width", [128, 512], ids="24-{0}-{0}".format)
 def bench_step(benchmark: Any, device: str, timed: Any, width: int, curvature: str) -> None:
     """One step from the same weights on the same states, line search included."""
-    skip_if_for_gpu(curvature, device)
     benchmark.group = f"trust-region step, 24-{width}-{width}, 5 Gaussians, {NUM_STATES} states"
     cfg, policy, _, closure_of = make_closures(width, device)
     optim = TrustRegionSafeOptimizer(

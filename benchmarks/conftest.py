@@ -18,6 +18,14 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--device", default="cpu", help="cpu or cuda: where tensors are")
 
 
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    if config.getoption("--device") == "cpu":
+        skip = pytest.mark.skip(reason="a CUDA graph is a GPU's")
+        for item in items:
+            if "cuda_graph" in item.name:
+                item.add_marker(skip)
+
+
 @pytest.fixture
 def device(request: pytest.FixtureRequest) -> str:
     """Where the benchmarked tensors are."""

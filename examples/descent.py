@@ -51,10 +51,9 @@ class Descent:
         finally:
             self.optim.zero_grad()
         self._skipped += skip
-        self._names = ["gradient norm", *terms]
         values = torch.stack([norm, *terms.values()]).detach()
         if self._bad is None:
-            self._bad = torch.zeros_like(values)
+            self._names, self._bad = ["gradient norm", *terms], torch.zeros_like(values)
         self._bad.copy_(torch.where(skip > 0, values, self._bad))  # in place: a graph's memory
 
     def count(self) -> float:

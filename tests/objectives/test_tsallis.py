@@ -265,7 +265,7 @@ class TestLossModule:
         data["next", "bonus"] = data["next"].pop("reward")
         assert loss(data)["loss_qvalue"].isfinite()
         data["my", "target"] = torch.zeros(8, 1, dtype=torch.float64)
-        prediction = loss._vmap_qnetworkN0(data, loss.qvalue_network_params)["other_value"]
+        prediction = loss._vmap_qnetworkN0(data, loss.qvalue_network_params, "other_value")
         expected = prediction.square().sum(0).mean()
         torch.testing.assert_close(loss.qvalue_v2_loss(data)[0], expected)
 
@@ -501,8 +501,8 @@ class TestAsUpstreamAsksOfALoss:
         loss = TsallisLoss(blocks[0], critic, num_qvalue_nets=2, delay_qvalue=False)
         twin = loss.qvalue_network_params.data
         twin.apply_(lambda x: x.copy_(x[:1].expand_as(x)))  # the same weights in both
-        values = loss._vmap_qnetworkN0(make_data(), loss.qvalue_network_params)
-        first, second = values["state_action_value"]
+        params = loss.qvalue_network_params
+        first, second = loss._vmap_qnetworkN0(make_data(), params, "state_action_value")
         assert not torch.allclose(first, second)
 
     @pytest.mark.parametrize("delay_actor", [False, True])

@@ -46,12 +46,12 @@ def test_outputs_are_those_of_the_members(count, deactivate_vmap):
     members, data = make_members(count), make_data()
     params = from_modules(*members, as_module=True)
     call = ensemble(make_module().eval(), randomness="error", deactivate_vmap=deactivate_vmap)
-    out = call(data, params)
-    assert out.batch_size == (count, 5)
-    for i, member in enumerate(members):
-        expected = member(data.clone())
-        for key in member.out_keys:
-            torch.testing.assert_close(out[key][i], expected[key], rtol=0, atol=1e-14)
+    for key in ("first", ("agent", "second")):
+        out = call(data, params, key)
+        assert out.shape == (count, 5, 1)
+        for value, member in zip(out, members, strict=True):
+            expected = member(data.clone())[key]
+            torch.testing.assert_close(value, expected, rtol=0, atol=1e-14)
 
 
 class _Critic(nn.Module):
@@ -80,9 +80,9 @@ def test_value_operators(in_keys):
         randomness="error",
         deactivate_vmap=True,
     )
-    out = call(data, from_modules(*members, as_module=True))
+    out = call(data, from_modules(*members, as_module=True), "value")
     assert set(data.keys()) == {"state", "agent"}
-    for value, member in zip(out["value"], members, strict=True):
+    for value, member in zip(out, members, strict=True):
         torch.testing.assert_close(value, member(data.clone())["value"], rtol=0, atol=1e-14)
 
 
@@ -91,7 +91,7 @@ def test_gradients_are_those_of_the_members():
     params = from_modules(*members, as_module=True)
     call = ensemble(make_module().eval(), randomness="error", deactivate_vmap=True)
     weight = torch.randn(2, 5, 1).double()
-    (call(data, params)["first"] * weight).sum().backward()
+    (call(data, params, "first") * weight).sum().backward()
     for i, member in enumerate(members):
         (member(data.clone())["first"] * weight[i]).sum().backward()
         for name, parameter in member.named_parameters():
@@ -109,9 +109,9 @@ def test_arguments_and_module_are_left_alone(fails):
     if fails:
         data["agent", "state"] = torch.randn(5, 7).double()
         with pytest.raises(RuntimeError, match="mat1 and mat2"):
-            call(data, params)
+            call(data, params, "first")
     else:
-        call(data, params)
+        call(data, params, "first")
     assert set(data.keys(True, True)) == {("agent", "state")}
     for name, value in module.state_dict().items():
         assert value.data_ptr() == before[name][0].data_ptr()
@@ -124,5 +124,5 @@ def test_random_layers_draw_for_each_member():
     )
     params = from_modules(linear, linear, as_module=True)
     call = ensemble(linear, randomness="different", deactivate_vmap=True)
-    first, second = call(TensorDict({"x": torch.ones(1, 1)}, [1]), params)["y"]
+    first, second = call(TensorDict({"x": torch.ones(1, 1)}, [1]), params, "y")
     assert not torch.equal(first == 0, second == 0)

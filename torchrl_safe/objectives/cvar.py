@@ -315,12 +315,7 @@ class CVaRCostLoss(LossModule):
         std_target = tensordict.get(keys.std_target, None)
         if mean_target is None or std_target is None:
             mean_target, std_target = self.compute_target(tensordict)
-        mean, std = self._predict(
-            tensordict,
-            tensordict.get(keys.action),
-            self.cost_network_params,
-            self.std_network_params,
-        )
+        mean, std = self._predict(tensordict, self.cost_network_params, self.std_network_params)
         out = {}
         for name, prediction, target in (("value", mean, mean_target), ("std", std, std_target)):
             loss = distance_loss(
@@ -329,9 +324,8 @@ class CVaRCostLoss(LossModule):
             out[f"loss_cost_{name}"] = self._reduce_loss(
                 loss, tensordict=tensordict, weights=weights
             )
-            out[f"cost_{name}"] = prediction.detach().mean(0)
-            if self.reduction != "none":
-                out[f"cost_{name}"] = out[f"cost_{name}"].mean()
+            each = self.reduction == "none"
+            out[f"cost_{name}"] = prediction.detach().mean(0 if each else None)
         td_out = TensorDict(out, tensordict.batch_size if self.reduction == "none" else [])
         self._clear_weakrefs(
             tensordict,
@@ -375,11 +369,13 @@ class CVaRCostLoss(LossModule):
             )
             mean, std = (
                 prediction.mean(0).unsqueeze(-1)
-                for prediction in self._predict(tensordict, action, *critics)
+                for prediction in self._predict(tensordict, *critics)
             )
             next_mean, next_std = (
                 prediction.mean(0).unsqueeze(-1)
-                for prediction in self._predict(next_tensordict, next_action, *critics)
+                for prediction in self._predict(
+                    self._inputs(next_tensordict, next_action), *critics
+                )
             )
             if isinstance(estimator, RetraceEstimator):
                 log_prob = tensordict.get(estimator_keys.policy_log_prob, None)
@@ -415,8 +411,7 @@ class CVaRCostLoss(LossModule):
             Mean and standard deviation, in units of the discounted cost sum, ``[*B]`` each.
         """
         mean, std = self._predict(
-            tensordict,
-            action,
+            self._inputs(tensordict, action),
             self.cost_network_params.detach(),
             self.std_network_params.detach(),
         )
@@ -451,9 +446,7 @@ class CVaRCostLoss(LossModule):
         """
         keys = self.tensor_keys
         with torch.no_grad():
-            std = self._vmap_std_network(
-                tensordict.select(*self.std_network.in_keys), self.std_network_params
-            ).get(keys.cost_std)
+            std = self._vmap_std_network(tensordict, self.std_network_params, keys.cost_std)
             mean = tensordict.get(_next(keys.cost)).mean() / (1 - self.value_estimator.gamma)
             return gaussian_cvar(mean, std.mean(), self.risk_level)
 
@@ -506,20 +499,19 @@ class CVaRCostLoss(LossModule):
         ):
             return self.actor_network.get_dist(tensordict)
 
-    def _predict(
-        self,
-        tensordict: TensorDictBase,
-        action: Tensor,
-        cost_params: TensorDictBase,
-        std_params: TensorDictBase,
-    ) -> tuple[Tensor, Tensor]:
-        keys = self.tensor_keys
+    def _inputs(self, tensordict: TensorDictBase, action: Tensor) -> TensorDictBase:
+        """What the critics read, with another action."""
         inputs = tensordict.select(
             *self.cost_network.in_keys, *self.std_network.in_keys, strict=False
         )
-        inputs.set(keys.action, action)
-        mean = self._vmap_cost_network(inputs, cost_params).get(keys.cost_value)
-        std = self._vmap_std_network(inputs, std_params).get(keys.cost_std)
+        return inputs.set(self.tensor_keys.action, action)
+
+    def _predict(
+        self, inputs: TensorDictBase, cost_params: TensorDictBase, std_params: TensorDictBase
+    ) -> tuple[Tensor, Tensor]:
+        keys = self.tensor_keys
+        mean = self._vmap_cost_network(inputs, cost_params, keys.cost_value)
+        std = self._vmap_std_network(inputs, std_params, keys.cost_std)
         return mean.squeeze(-1), std.squeeze(-1)
 
 

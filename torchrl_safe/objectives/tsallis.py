@@ -289,10 +289,8 @@ class TsallisLoss(SACLoss):
             target = self.compute_target(tensordict)
         target = target.squeeze(-1)
         prediction = self._vmap_qnetworkN0(
-            tensordict.select(*self.qvalue_network.in_keys, strict=False),
-            self.qvalue_network_params,
-        )
-        prediction = prediction.get(self.tensor_keys.state_action_value).squeeze(-1)
+            tensordict, self.qvalue_network_params, self.tensor_keys.state_action_value
+        ).squeeze(-1)
         td_error = (prediction.detach() - target).abs().max(0)[0]
         loss = distance_loss(prediction, target.expand_as(prediction), self.loss_function).sum(0)
         loss = self._reduce_loss(loss, tensordict=tensordict, weights=weights)
@@ -303,5 +301,5 @@ class TsallisLoss(SACLoss):
     ) -> Tensor:
         inputs = tensordict.select(*self.qvalue_network.in_keys, strict=False)
         inputs.set(self.tensor_keys.action, action)
-        values = self._vmap_qnetworkN0(inputs, params).get(self.tensor_keys.state_action_value)
+        values = self._vmap_qnetworkN0(inputs, params, self.tensor_keys.state_action_value)
         return values.squeeze(-1).min(0)[0]

@@ -1,194 +1,154 @@
 """Where the time of an update goes: a Markdown table of its parts.
 
+    pip install -e ".[bench]"
     python benchmarks/profile_training.py                      # defaults of the example, one thread
     python benchmarks/profile_training.py policy.num_components=5  # any option of it
 
-The example runs as it is, with marks of torch.profiler around its parts. Of each part the table
-says how much is inside torch's kernels (self time of ``aten`` operations and of what
-``torch.compile`` fused), inside the simulator (``mujoco.batch``), and neither: Python, tensordict,
-autograd's engine.
+The example runs as it is, and py-spy looks at its stack 25 times a second, at Python's and
+at the native one. Of each part the table says how often torch was at work (its native code, or its
+Python: modules, optimizers), MuJoCo, or neither: tensordict, TorchRL, NumPy, this library.
 
-The profiler slows what it watches: by as much for every event, the table assumes, and takes that
-off where the event was. An event inside a kernel's lengthens it, any other its part alone.
+Nothing is added to the example but these breaks: a profiler that notes every
+operation makes short ones longer, by an amount that is as large as what the table is to show.
+py-spy needs Linux, and the right to look at a process of the same user.
 """
 
 from __future__ import annotations
 
-import statistics
+import ctypes
+import os
+import re
+import signal
+import subprocess
 import sys
 import tempfile
-import time
 from collections import Counter
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable, Iterator
 from contextlib import redirect_stdout
 from pathlib import Path
-from typing import Any
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "examples"))
 
-import collectors
-import critics
 import safetac_point
 import utils
 from bench_training import SILENT, compose, warm_up_updates
-from torch._inductor import config as inductor
-from torch.autograd.profiler_util import FunctionEvent
-from torch.profiler import ProfilerActivity, profile, record_function
-from torchrl._utils import timeit
 
-from torchrl_safe.envs import _core
-
+NUM_UPDATES = 16  # after the warm-up
+RATE = 25  # looks per second: each stops the example for milliseconds
+# Functions whose time is a part's, the innermost first to be looked at.
 PARTS = {
-    "collect": "collect: policy, environment, tensordicts",
-    "replay": "replay: store and sample slices",
-    "time/targets": "targets: networks and Retrace",
-    "time/critics": "critics: gradient steps",
-    "time/policy": "trust-region step",
+    "collect: policy, environment, tensordicts": ["Collector.rollout"],
+    "replay: store and sample slices": ["ReplayBuffer.extend", "ReplayBuffer.sample"],
+    "targets: networks and Retrace": ["with_targets"],
+    "critics: gradient steps": ["CriticFit.__init__.<locals>.descend"],
+    "policy: trust-region step": ["main.<locals>.update"],
+    "logging and what is left": ["train"],
 }
-SIMULATOR = "simulator"
-NUM_TIMED = 3  # updates without the profiler, after the warm-up
+PART_OF = {function: part for part, functions in PARTS.items() for function in functions}
+# Whose work it is, by the file it is in. One that is nobody's, such as the C library, works for
+# its caller. torch.compile names its files by a hash.
+OWNERS = {
+    "torch, native": r"lib(torch|c10|gomp|cu[a-z]+)\w*[.-].*so|\w+\.main\.cpp$",
+    "torch, Python": r"torch/|c\w{51}\.py$",
+    "MuJoCo": r"mujoco/",
+    "neither": r".*\.py$|numpy/|tensordict/|<",
+}
+FRAME = re.compile(r"(?P<function>.*) \((?P<file>[^()]*?)(:\d+)?\)$")
+PR_SET_PTRACER, PR_SET_PTRACER_ANY = 0x59616D61, ctypes.c_ulong(-1)
 
 
-def marked(name: str, call: Callable[..., Any]) -> Callable[..., Any]:
-    """The same function, seen by the profiler under a name."""
-
-    def wrapper(*args: Any, **kwargs: Any) -> Any:
-        with record_function(name):
-            return call(*args, **kwargs)
-
-    return wrapper
-
-
-class MarkedTimer(timeit):
-    """The example's timer, seen by the profiler too."""
-
-    def __enter__(self) -> MarkedTimer:
-        self._mark = record_function(self.name)
-        self._mark.__enter__()
-        return super().__enter__()
-
-    def __exit__(self, *error: Any) -> None:
-        super().__exit__(*error)
-        self._mark.__exit__(*error)
-
-
-def mark_parts() -> None:
-    """Put marks where the example, its replay and the environment do their work."""
-    critics.timeit = safetac_point.timeit = MarkedTimer
-    rollout = collectors.ResumableCollector.rollout
-    collectors.ResumableCollector.rollout = marked("collect", rollout)
-    _core.Batch.step = marked(SIMULATOR, _core.Batch.step)
-    make_buffer = safetac_point.make_buffer
-
-    def make_marked_buffer(cfg: Any) -> Any:
-        buffer = make_buffer(cfg)
-        for name in ("extend", "sample"):
-            setattr(buffer, name, marked("replay", getattr(buffer, name)))
-        return buffer
-
-    safetac_point.make_buffer = make_marked_buffer
-
-
-def record(overrides: list[str]) -> tuple[list[FunctionEvent], float, float]:
-    """Run the example until one update is profiled.
+def record(overrides: list[str]) -> list[str]:
+    """Run the example under py-spy's eyes.
 
     Returns:
-        tuple: the profiler's events, seconds of the profiled update, and of one without profiler.
+        list: a line per stack, outermost frame first, with the number of times it was seen.
     """
     cfg = compose(["num_threads=1", *overrides, *SILENT])
-    updates = warm_up_updates(cfg) + NUM_TIMED + 1  # the last one is profiled
-    cfg.collector.total_frames = updates * cfg.collector.frames_per_batch
-    profiler = profile(activities=[ProfilerActivity.CPU])
-    ended: list[float] = []
-    begun: list[float] = []
-    log = utils.Run.log
+    first = warm_up_updates(cfg)
+    last = first + NUM_UPDATES
+    cfg.collector.total_frames = last * cfg.collector.frames_per_batch
+    # Where a process may look at its children alone, it has to be allowed to look at its parent.
+    ctypes.CDLL(None).prctl(PR_SET_PTRACER, PR_SET_PTRACER_ANY, 0, 0, 0)
+    log, updates = utils.Run.log, 0
+    sampler: subprocess.Popen[str]
 
     def log_and_watch(run: utils.Run, metrics: dict[str, float]) -> None:
+        nonlocal sampler, updates
         log(run, metrics)  # the last thing an update does
-        ended.append(time.perf_counter())
-        if len(ended) == updates - 1:
-            profiler.start()
-        elif len(ended) == updates:
-            profiler.stop()
-        begun.append(time.perf_counter())
+        updates += 1
+        if updates == first:
+            sampler = start_sampler(stacks)
+        elif updates == last:
+            sampler.send_signal(signal.SIGINT)
+            sampler.communicate()
 
     utils.Run.log = log_and_watch
-    mark_parts()
     with tempfile.TemporaryDirectory() as run_dir:
-        cfg.run_dir = run_dir
+        cfg.run_dir, stacks = run_dir, Path(run_dir, "stacks")
         with redirect_stdout(sys.stderr):
             safetac_point.main.__wrapped__(cfg)
-    spans = [end - begin for begin, end in zip(begun, ended[1:updates], strict=False)]
-    return profiler.events(), spans[-1], statistics.median(spans[-1 - NUM_TIMED : -1])
+        return stacks.read_text().splitlines()
 
 
-def attribute(events: list[FunctionEvent], slowdown: float) -> dict[str, Counter]:
-    """Microseconds of each part, without those inside it, had the profiler not slowed it.
+def start_sampler(stacks: Path) -> subprocess.Popen[str]:
+    """Returns once it has begun.
+
+    Raises:
+        RuntimeError: if it has ended before, with what it said.
+    """
+    command = ["py-spy", "record", "--native", "--idle", "--threads", "--format", "raw"]
+    command += ["--rate", str(RATE), "--pid", str(os.getpid()), "--output", str(stacks)]
+    sampler = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+    said = []
+    assert sampler.stdout is not None
+    for line in sampler.stdout:
+        said.append(line)
+        if "Sampling process" in line:
+            return sampler
+    with sampler:
+        raise RuntimeError("".join(said))
+
+
+def attribute(stacks: Iterable[str]) -> dict[str, Counter[str]]:
+    """How often each part was seen, by whose work it was. Threads but the main one do not count.
 
     Args:
-        events (list of FunctionEvent): the profiler's.
-        slowdown (float): microseconds that all of them cost together.
-
-    Returns:
-        dict: ``"time"``, and of it ``"kernels"`` and ``"simulator"``.
+        stacks (iterable of str): py-spy's raw format.
     """
-    cost = slowdown / len(events)
-    out: dict[str, Counter] = {name: Counter() for name in ("time", "kernels", "simulator")}
-    for event in events:
-        outer = list(ancestors(event.cpu_parent))
-        part = next((e.name for e in outer if e.name in PARTS), None)
-        out["time"][part] -= cost
-        if event.name in PARTS:
-            out["time"][event.name] += event.cpu_time_total
-            if part is not None:
-                out["time"][part] -= event.cpu_time_total
-        elif event.name == SIMULATOR:
-            out["simulator"][part] += event.cpu_time_total
-        elif is_kernel(event):
-            out["kernels"][part] += event.self_cpu_time_total
-        if outer and is_kernel(outer[0]):
-            out["kernels"][part] -= cost
-    return out
+    seen: dict[str, Counter[str]] = {part: Counter() for part in PARTS}
+    for line in stacks:
+        stack, _, count = line.rpartition(" ")
+        frames = stack.split(";")
+        if "MainThread" in frames[0]:
+            inwards = [match for match in map(FRAME.match, reversed(frames)) if match]
+            seen[part_of(inwards)][owner_of(inwards)] += int(count)
+    return seen
 
 
-def is_kernel(event: FunctionEvent) -> bool:
-    return event.name.startswith("aten::") or "cpp_fused" in event.name
+def part_of(inwards: Iterable[re.Match[str]]) -> str:
+    functions = (frame["function"] for frame in inwards)
+    return next((PART_OF[f] for f in functions if f in PART_OF), list(PARTS)[-1])
 
 
-def ancestors(event: FunctionEvent | None) -> Iterable[FunctionEvent]:
-    while event is not None:
-        yield event
-        event = event.cpu_parent
+def owner_of(inwards: Iterable[re.Match[str]]) -> str:
+    def owners() -> Iterator[str]:
+        for frame in inwards:
+            yield from (name for name, at in OWNERS.items() if re.match(at, frame["file"]))
+
+    return next(owners(), "neither")
 
 
 def main(overrides: list[str]) -> None:
-    """Profile one update and print the table."""
-    inductor.cpp.enable_kernel_profile = True
-    events, profiled, plain = record(overrides)
-    times = attribute(events, 1e6 * (profiled - plain))
-    times["time"][None] = 1e6 * plain - sum(times["time"].values()) + times["time"][None]
-    print("| part of an update | seconds | share | in torch's kernels | in MuJoCo | neither |")
-    print("|---|---:|---:|---:|---:|---:|")
-    sums = Counter()
-    for part, text in {**PARTS, None: "logging and what is left"}.items():
-        cells = {name: counter[part] for name, counter in times.items()}
-        cells["neither"] = cells["time"] - cells["kernels"] - cells["simulator"]
-        sums.update(cells)
-        print(row(text, cells, plain))
-    print(row("**whole update**", sums, plain))
+    """Watch some updates and print the table."""
+    seen = attribute(record(overrides))
+    total = sum(counter.total() for counter in seen.values())
+    print("| part of an update | share | " + " | ".join(OWNERS) + " |")
+    print("|---|" + "---:|" * (1 + len(OWNERS)))
+    for part, counter in {**seen, "**whole update**": sum(seen.values(), Counter())}.items():
+        counts = (counter.total(), *(counter[owner] for owner in OWNERS))
+        print(f"| {part} | " + " | ".join(f"{count / total:.1%}" for count in counts) + " |")
     print()
-    print(
-        f"Shares are of the whole update, {plain:.2f} s (median of {NUM_TIMED}). It took "
-        f"{profiled:.2f} s with the profiler, "
-        f"{1e6 * (profiled - plain) / len(events):.1f} us per event more, which the table leaves "
-        "out, wherever the events were."
-    )
-
-
-def row(text: str, cells: dict[str, float], seconds: float) -> str:
-    shares = (f"{cells[name] / seconds / 1e6:.1%}" for name in ("time", "kernels", "simulator"))
-    neither = f"{cells['neither'] / seconds / 1e6:.1%}"
-    return f"| {text} | {cells['time'] / 1e6:.2f} | " + " | ".join([*shares, neither]) + " |"
+    print(f"Shares are of {total:,} looks at {NUM_UPDATES} updates.")
 
 
 if __name__ == "__main__":

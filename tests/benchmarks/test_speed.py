@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from types import SimpleNamespace
-
 import profile_training
 import pytest
 import report
@@ -60,32 +58,43 @@ def shell_quoted(command):
     return f'{program} {flag} "{code}"'
 
 
-def test_time_is_the_innermost_parts():
-    """Critics of 100 us hold a replay of 30 us; kernels count once, where they run."""
-
-    def event(name, total, own, parent=None):
-        return SimpleNamespace(
-            name=name, cpu_time_total=total, self_cpu_time_total=own, cpu_parent=parent
-        )
-
-    critics = event("time/critics", 100, 20)
-    replay = event("replay", 30, 5, critics)
-    index = event("aten::index", 25, 10, replay)
-    copy = event("aten::copy_", 15, 15, index)
-    backward = event("AddmmBackward0", 50, 0, critics)
-    product = event("aten::mm", 50, 50, backward)
-    collect = event("collect", 40, 10)
-    simulator = event(profile_training.SIMULATOR, 30, 30, collect)
-    fused = event("graph_0_cpp_fused_relu_1", 10, 10, collect)
-    events = [critics, replay, index, copy, backward, product, collect, simulator, fused]
-    assert profile_training.attribute(events, slowdown=0.0) == {
-        "time": {"time/critics": 70, "replay": 30, "collect": 40, None: 0},
-        "kernels": {"time/critics": 50, "replay": 25, "collect": 10},
-        "simulator": {"collect": 30},
+def test_a_look_is_the_innermost_parts_and_its_nearest_owners():
+    main = "MainThread;main (safetac_point.py:147);train (utils.py:160)"
+    update = f"{main};main.<locals>.update (safetac_point.py:122);CriticFit.__call__ (critics.py:9)"
+    descend = f"{update};CriticFit.__init__.<locals>.descend (critics.py:155)"
+    collect = f"{main};Collector.rollout (torchrl/collectors/_single.py:2)"
+    forward = f"{descend};Module._call_impl (torch/nn/modules/module.py:1)"
+    runner = f"Runner.call (c{'a1' * 25}b.py:3)"
+    stacks = [
+        # A product, called from Python; memory for it; the call; what is called.
+        f"{forward};at::mm(at::Tensor const&) (libtorch_cpu.so) 16",
+        f"{forward};at::empty (libc10.so);malloc (libc.so.6) 8",
+        f"{forward} 4",
+        f"{forward};call (torchrl_safe/objectives/utils.py:50);PyObject_Call (libpython3.11.so) 2",
+        f"{descend};{runner};kernel (c{'a1' * 25}b.main.cpp:8) 1",
+        f"{descend};{runner} 32",
+        # A replay in it is a part of its own, the trust region whatever else an update does.
+        f"{update};ReplayBuffer.sample (torchrl/data/replay_buffers/base.py:1) 3",
+        f"{update};step (numpy/_core/_multiarray_umath.cpython-311-x86_64-linux-gnu.so) 5",
+        f"{collect};mj_step (mujoco/libmujoco.so.3.17.0) 7",
+        f"{collect};mj_step (mujoco/libmujoco.so.3.17.0);sin (libm.so.6) 1",
+        "MainThread;gc_collect_main (libpython3.11.so.1.0) 9",
+        "thread (0x1): Thread-1;train (utils.py:160);run (libtorch_cpu.so) 99",
+    ]
+    seen = profile_training.attribute(stacks)
+    assert {part.partition(":")[0]: dict(counts) for part, counts in seen.items()} == {
+        "collect": {"MuJoCo": 8},
+        "replay": {"neither": 3},
+        "targets": {},
+        "critics": {"torch, native": 25, "torch, Python": 36, "neither": 2},
+        "policy": {"neither": 5},
+        "logging and what is left": {"neither": 9},
     }
-    # One microsecond per event, taken off the part and the kernel that it is inside of.
-    assert profile_training.attribute(events, slowdown=len(events)) == {
-        "time": {"time/critics": 67, "replay": 28, "collect": 38, None: -2},
-        "kernels": {"time/critics": 50, "replay": 24, "collect": 10},
-        "simulator": {"collect": 30},
-    }
+
+
+def test_a_profile_without_permission_says_what_py_spy_said(tmp_path, monkeypatch):
+    (tmp_path / "py-spy").write_text("#!/bin/sh\necho Permission Denied: try sudo\nexit 1\n")
+    (tmp_path / "py-spy").chmod(0o755)
+    monkeypatch.setenv("PATH", str(tmp_path), prepend=":")
+    with pytest.raises(RuntimeError, match="Permission Denied: try sudo"):
+        profile_training.start_sampler(tmp_path / "stacks")

@@ -54,6 +54,27 @@ def test_outputs_are_those_of_the_members(count, deactivate_vmap):
             torch.testing.assert_close(value, expected, rtol=0, atol=1e-14)
 
 
+@pytest.mark.parametrize("deactivate_vmap", [False, True])
+def test_an_output_that_is_not_written(deactivate_vmap):
+    module = make_module().eval()
+    call = ensemble(module, randomness="error", deactivate_vmap=deactivate_vmap)
+    with pytest.raises(KeyError, match="third"):
+        call(make_data(), from_modules(module, as_module=True), "third")
+
+
+def test_modules_that_are_shared():
+    """A layer that is used twice is there twice, or its second use would keep the first weights."""
+    layer = nn.Linear(3, 3).double()
+    module = TensorDictModule(nn.Sequential(layer, nn.Tanh(), layer), ["x"], ["y"])
+    data = TensorDict({"x": torch.randn(5, 3).double()}, [5])
+    expected = module(data.clone())["y"]
+    params = from_modules(module, as_module=True)
+    with torch.no_grad():
+        layer.weight.zero_()
+    call = ensemble(module, randomness="error", deactivate_vmap=True)
+    torch.testing.assert_close(call(data, params, "y")[0], expected)
+
+
 class _Critic(nn.Module):
     """Names of its arguments are in another order than those of the keys."""
 

@@ -72,7 +72,7 @@ def _value_of(module: TensorDictModule) -> Callable[[TensorDictBase, NestedKey],
     def value_of(tensordict: TensorDictBase, key: NestedKey) -> Tensor:
         if direct and key == module.out_keys[0]:
             return module.module(*map(tensordict.get, module.in_keys))
-        return module(tensordict.copy())[key]
+        return module(tensordict.select(*module.in_keys, strict=False))[key]
 
     return value_of
 

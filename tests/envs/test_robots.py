@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from copy import copy
 from dataclasses import replace
 
 import mujoco
@@ -12,8 +13,8 @@ import torch
 from tensordict import TensorDict
 from torchrl.envs.utils import check_env_specs
 
-from torchrl_safe.envs import SafeGoalEnv, get_robot
-from torchrl_safe.envs._core import RobotBatch
+from torchrl_safe.envs import ROBOTS, Randomization, SafeGoalEnv, get_robot
+from torchrl_safe.envs._core import RobotBatch, make_core
 
 CAPSULE, CYLINDER = mujoco.mjtGeom.mjGEOM_CAPSULE, mujoco.mjtGeom.mjGEOM_CYLINDER
 BOX, SPHERE = mujoco.mjtGeom.mjGEOM_BOX, mujoco.mjtGeom.mjGEOM_SPHERE
@@ -182,18 +183,68 @@ def test_motion_is_that_of_safety_gym(name, reference, turn, tolerance):
             facing = (rotation @ ahead)[:2]
             assert (position_seen == qpos[:2]).all()
             np.testing.assert_allclose(heading, facing / np.linalg.norm(facing), atol=1e-10)
-            # The accelerometer is read where the last physics step computed it, in the frame the
-            # step ended in.
-            felt = rotation.T @ (data.qacc[:3] - model.opt.gravity)
-            np.testing.assert_allclose(acceleration, (felt @ ahead, felt @ to_left), atol=1e-8)
-            # Sensors of the state the step ended in; aside, or the solver would start elsewhere.
+            # Sensors of the state the step ended in, which Safety Gym reads after a mj_forward.
             mujoco.mj_copyData(aside, model, data)
             mujoco.mj_forward(model, aside)
+            felt = aside.sensor("accelerometer").data
+            np.testing.assert_allclose(acceleration, (felt @ ahead, felt @ to_left), atol=1e-8)
             velocity = aside.sensor("velocimeter").data
             np.testing.assert_allclose((u, v), (velocity @ ahead, velocity @ to_left), atol=1e-10)
             np.testing.assert_allclose(yaw_rate, aside.sensor("gyro").data[2], atol=1e-10)
         travelled = max(travelled, np.abs(robots.motion.position - position).max())
     assert travelled > 0.1
+
+
+VARIED = Randomization(mass=(0.7, 1.4), friction=(0.5, 1.5), actuator_gain=(0.8, 1.2))
+
+
+@pytest.mark.parametrize("randomization", [None, VARIED], ids=["as modelled", "varied"])
+@pytest.mark.parametrize("name", ROBOTS)
+def test_acceleration_is_what_an_accelerometer_reads(name, randomization):
+    """A MuJoCo sensor on the robot, read after ``mj_forward`` at the state the step ended in."""
+    robot = get_robot(name)
+    if robot.proprioception_scale != get_robot("point").proprioception_scale:
+        # Readings of their own have no acceleration: read as a free base's, it has to be there too.
+        robot = replace(robot, sense=get_robot("car").sense, proprioception_scale=(1.0,) * 5)
+    num_envs = 3
+    options = {"num_envs": num_envs, "num_threads": 1, "seed": 2, "episode_length": 99}
+    core = make_core(robot, randomization=randomization, **options)
+    core.reset()
+    simulations = []
+    for i in range(num_envs):
+        spec = mujoco.MjSpec.from_file(str(robot.asset_path))
+        spec.option.timestep = robot.timestep
+        spec.body("robot").add_site(name="imu")
+        kind, site = mujoco.mjtSensor.mjSENS_ACCELEROMETER, mujoco.mjtObj.mjOBJ_SITE
+        spec.add_sensor(name="felt", type=kind, objtype=site, objname="imu")
+        model = spec.compile()
+        data = mujoco.MjData(model)
+        if randomization is not None:
+            state = core.snapshot()
+            model.body_mass *= state["variation_mass"][i]
+            model.body_inertia *= state["variation_mass"][i]
+            model.geom_friction *= state["variation_friction"][i]
+            model.dof_damping *= state["variation_friction"][i]
+            model.actuator_gainprm *= state["variation_actuator_gain"][i]
+            mujoco.mj_setConst(model, data)
+            mujoco.mj_resetData(model, data)
+        data.qpos[:] = core.qpos(i)
+        mujoco.mj_forward(model, data)
+        simulations.append((model, data))
+    largest = 0.0
+    for action in held_actions(robot.action_dim, num_envs):
+        for (_, data), row in zip(simulations, action, strict=True):
+            state = data.qpos, data.qvel, np.array(data.time)
+            data.ctrl[:] = robot.control(row[None], *(x[None] for x in state))[0]
+        core.step(action)
+        for i, (model, data) in enumerate(simulations):
+            mujoco.mj_step(model, data, robot.substeps)
+            aside = copy(data)  # or the solver's next first guess would be another one
+            mujoco.mj_forward(model, aside)
+            felt = aside.sensor("felt").data[:2]
+            np.testing.assert_allclose(core._robots.motion.proprioception[i, :2], felt, atol=1e-6)
+            largest = max(largest, np.abs(felt).max())
+    assert largest > 0.1
 
 
 def rotation_of(quaternion: np.ndarray) -> np.ndarray:

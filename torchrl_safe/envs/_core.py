@@ -32,6 +32,8 @@ _WARNING = mujoco.mjtWarning
 _DIVERGED = [
     int(w) for w in (_WARNING.mjWARN_BADQPOS, _WARNING.mjWARN_BADQVEL, _WARNING.mjWARN_BADQACC)
 ]
+# MuJoCo's derived fields lag behind the state by one physics step, unless it is asked for them.
+_ACCELERATION = mujoco.mjtStage.mjSTAGE_ACC.value
 
 
 class RobotBatch:
@@ -48,8 +50,8 @@ class RobotBatch:
             robots that are all as their model, which is cheaper.
 
     Attributes:
-        motion (Motion): where the robots are and what they sense. Its acceleration is that of the
-            last physics step: MuJoCo's derived fields lag behind the state by one.
+        motion (Motion): where the robots are and what they sense. Accelerations are evaluated once
+            more after the last physics step, at the state it led to and under the same command.
         variation (Variation or None): how the robots differ from their model.
         commands (array or None): [N, max_delay + 1, nu], the last ones, newest first.
     """
@@ -139,12 +141,15 @@ class RobotBatch:
         command = self.robot.control(action, self._qpos, self._qvel, self._time)
         self._ctrl[:] = self._late(command)
         try:
-            batch.step(nstep=self.robot.substeps)
+            batch.step(nstep=self.robot.substeps, stage=_ACCELERATION)
             failed = np.zeros(self.num_envs, bool)
         except SimulationError:
             failed = batch.status != 0
         if self._warning.any():  # hardly ever: what follows is left out
             failed |= self._warning[:, _DIVERGED, 1].any(-1)
+        for value in (self._qpos, self._qvel, self._qacc):
+            # MuJoCo looks at the states that physics steps start from only. NaN compares false.
+            failed |= ~(np.abs(value).max(-1) < mujoco.mjMAXVAL)
         sensed = self.robot.sense(self._qpos, self._qvel, self._qacc)
         if failed.any():
             batch.state[failed] = self._before[failed]

@@ -24,7 +24,7 @@ from torchrl.envs import EnvBase
 from utils import make_critic
 
 from torchrl_safe import CVaRCostLoss, GMMTanhPolicy, TsallisLoss
-from torchrl_safe.objectives.value import with_policy
+from torchrl_safe.objectives.value import PolicyEvaluation, evaluate_policy
 
 REPLAYED = [
     "observation",
@@ -127,8 +127,13 @@ class CriticFit:
         self.buffer = buffer
         self.descent = Descent(cfg, optim)
 
-        def targets_of(part: TensorDictBase) -> tuple[Tensor, Tensor, Tensor]:
-            return reward_loss.compute_target(part), *cost_loss.compute_target(part)
+        def targets_of(
+            part: TensorDictBase, policy: PolicyEvaluation
+        ) -> tuple[Tensor, Tensor, Tensor]:
+            return (
+                reward_loss.compute_target(part, policy=policy),
+                *cost_loss.compute_target(part, policy=policy),
+            )
 
         def losses_of(minibatch: TensorDictBase) -> TensorDictBase:
             losses = cost_loss(minibatch)
@@ -187,12 +192,12 @@ class CriticFit:
 def with_targets(
     trajectories: TensorDictBase,
     actor: GMMTanhPolicy,
-    targets_of: Callable[[TensorDictBase], tuple[Tensor, Tensor, Tensor]],
+    targets_of: Callable[[TensorDictBase, PolicyEvaluation], tuple[Tensor, Tensor, Tensor]],
 ) -> TensorDictBase:
     """Transitions of trajectories [B, T] with the targets of (4) and (18), flat."""
-    trajectories = with_policy(trajectories, actor, shifted=True)
+    policy = evaluate_policy(trajectories, actor, shifted=True)
     names = ("value_target", "cost_target", "std_target")
-    targets = dict(zip(names, targets_of(trajectories), strict=True))
+    targets = dict(zip(names, targets_of(trajectories, policy), strict=True))
     return trajectories.select("observation", "action").update(targets).flatten()
 
 

@@ -8,7 +8,6 @@ Every option is in offpolicy_trc.yaml, trc.yaml, constrained.yaml and base.yaml.
 from __future__ import annotations
 
 import hydra
-import torch
 from critics import REPLAYED, make_buffer
 from descent import Descent
 from omegaconf import DictConfig
@@ -39,11 +38,9 @@ def main(cfg: DictConfig) -> None:
     )
 
     def replay(num_frames: int) -> TensorDictBase:
-        """Slices [B, T], with the density of their actions under the policy of now."""
-        data = buffer.sample(num_frames).reshape(-1, cfg.replay_buffer.slice_len)
-        with torch.no_grad():
-            log_prob = policy.get_dist(data).log_prob(data["action"])
-        return data.set("policy_log_prob", log_prob)
+        """Steps of slices with the advantages of the policy of now."""
+        slices = buffer.sample(num_frames).reshape(-1, cfg.replay_buffer.slice_len)
+        return with_advantages(slices, reward_loss, cost_loss, policy)
 
     def update(batch: TensorDictBase) -> dict[str, float]:
         """Critics, then a trust-region step, on old and new data; the level is of the new."""
@@ -53,10 +50,10 @@ def main(cfg: DictConfig) -> None:
         cost_loss.cost_limit.fill_(cost_limit_at(cfg, run.frames))
         with timeit("time/critics"):
             for _ in range(cfg.optim.critic_rounds):
-                data = with_advantages(replay(cfg.optim.critic_frames), reward_loss, cost_loss)
+                data = replay(cfg.optim.critic_frames)
                 losses = fit_critics(cfg, data, reward_loss, cost_loss, descent)
         with timeit("time/policy"):
-            data = with_advantages(replay(cfg.optim.policy_frames), reward_loss, cost_loss)
+            data = replay(cfg.optim.policy_frames)
             step = policy_step(policy, policy_optim, reward_loss, cost_loss, data, batch)
         return {**losses, **step}
 

@@ -37,10 +37,22 @@ def make_surrogates(
 
 
 def with_advantages(
-    trajectories: TensorDictBase, reward_loss: ReturnSurrogateLoss, cost_loss: CVaRSurrogateLoss
+    trajectories: TensorDictBase,
+    reward_loss: ReturnSurrogateLoss,
+    cost_loss: CVaRSurrogateLoss,
+    policy: GMMTanhPolicy | None = None,
 ) -> TensorDictBase:
-    """Steps of trajectories [B, T] with advantages and critics' targets, flat."""
-    return cost_loss.compute_advantage(reward_loss.compute_advantage(trajectories)).flatten()
+    """Steps of trajectories [B, T] with advantages and critics' targets, flat.
+
+    Advantages are those of ``policy``, by default of the one that acted.
+    """
+    log_prob = None
+    if policy is not None:
+        with torch.no_grad():
+            log_prob = policy.get_dist(trajectories).log_prob(trajectories["action"])
+    for loss in (reward_loss, cost_loss):
+        trajectories = loss.compute_advantage(trajectories, policy_log_prob=log_prob)
+    return trajectories.flatten()
 
 
 def fit_critics(

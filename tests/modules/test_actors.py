@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import copy
+import math
 import pickle
 import subprocess
 import sys
@@ -105,6 +106,39 @@ class TestPolicy:
         assert td["action_log_prob"].shape == (7,)
         score = policy.get_dist(td).log_prob(td["action"])
         torch.testing.assert_close(td["action_log_prob"], score, rtol=1e-4, atol=1e-4)
+
+    @pytest.mark.parametrize("relaxation", RELAXATIONS)
+    @pytest.mark.parametrize("gradients", [True, False])
+    @pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float32, torch.float64])
+    @pytest.mark.parametrize("box", [(-1.0, 1.0), (100.0, 101.0), (-2.0, 3.0)])
+    @pytest.mark.parametrize(
+        ("loc", "log_std"), [(0.0, 0.0), (11.0, -1.0), (40.0, -50.0), (-9.0, 50.0)]
+    )
+    def test_ratio_of_a_policy_to_itself(self, relaxation, gradients, dtype, box, loc, log_std):
+        """Saturated, narrow, wide: what is stored is the density of the stored action."""
+        features = torch.tensor([0.3, 0.0, loc, -loc, log_std, log_std], dtype=dtype)
+        spec = Bounded(*box, shape=(1,), dtype=dtype)
+        policy = GMMTanhPolicy(Constant(features), spec, num_components=2, relaxation=relaxation)
+        with torch.set_grad_enabled(gradients):
+            data = policy(make_data(200).to(dtype)).detach()
+        score = policy.get_dist(data).log_prob(data["action"])
+        assert score.isfinite().all()
+        assert torch.equal(data["action_log_prob"], score)
+        (score * torch.randn(200).to(dtype)).mean().backward()
+        (network, _) = policy[0].module
+        assert network.features.grad.abs().sum() > 0
+
+    def test_entropy_is_of_the_draw(self):
+        """Scored where tanh rounded it, a saturated policy would look random to an entropy."""
+        features = torch.tensor([0.0, 20.0, -2.0], dtype=torch.float64)
+        policy = GMMTanhPolicy(Constant(features), Bounded(-1.0, 1.0, (1,)), num_components=1)
+        dist = policy.get_dist(make_data(20_000).double())
+        torch.manual_seed(0)
+        _, drawn = dist.sample_and_log_prob()
+        # h(tanh u) = h(u) + E log(1 - tanh^2 u), the latter 2 (log 2 - u) this far out
+        scale = dist.scale[0].item()
+        entropy = 0.5 * math.log(2 * math.pi * math.e * scale**2) + 2 * (math.log(2) - 20.0)
+        assert -drawn.mean().item() == pytest.approx(entropy, abs=0.02)
 
     def test_score_is_optional(self):
         td = make_policy(return_log_prob=False)(make_data(7))

@@ -103,6 +103,77 @@ class TestDensity:
             expected = float(mpmath.log(density / (1 - y**2)))
         assert score.item() == pytest.approx(expected, rel=1e-5 if dtype.itemsize == 4 else 1e-12)
 
+    @pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float32, torch.float64])
+    @pytest.mark.parametrize(
+        "box", [(-1, 1), (0, 1), (-2, 3), (100, 101), (288, 300), (-310, -300), (-1e-3, 1e4)]
+    )
+    def test_on_a_bound_the_nearest_action_inside_is_scored(self, dtype, box):
+        """Against mpmath at the action that is as near as numbers, and tanh, come to the bound."""
+        low, high = (torch.tensor([bound], dtype=dtype) for bound in box)
+        logits, loc, scale = torch.zeros(1), torch.full((1, 1), 5.0), torch.full((1, 1), 0.5)
+        parameters = [p.to(dtype) for p in (logits, loc, scale)]
+        dist = TanhGaussianMixture(*parameters, low=low, high=high)
+        for bound, other in ((low, high), (high, low)):
+            score = dist.log_prob(bound)
+            assert score == dist.log_prob(bound.nextafter(other))
+            assert score == dist.log_prob(bound.nextafter(2 * bound - other))  # outside
+            with mpmath.workdps(60):
+                a, b = mpmath.mpf(low.item()), mpmath.mpf(high.item())
+                margin = (high - low) * torch.finfo(dtype).eps / 4  # of tanh's last value
+                if bound is low:
+                    inside = mpmath.mpf(max(low.nextafter(high), low + margin).item())
+                else:
+                    inside = mpmath.mpf(min(high.nextafter(low), high - margin).item())
+                u = mpmath.log((inside - a) / (b - inside)) / 2
+                slope = 2 * (inside - a) * (b - inside) / (b - a)
+                expected = float(mpmath.log(mpmath.npdf(u, 5, mpmath.mpf("0.5")) / slope))
+            digits = {torch.bfloat16: 0.05, torch.float32: 1e-5, torch.float64: 1e-9}[dtype]
+            assert score.item() == pytest.approx(expected, rel=digits)
+
+    @pytest.mark.parametrize("box", [(-1.0, 1.0), (-2.0, 3.0), (100.0, 101.0)])
+    def test_slope_of_the_score_in_the_action(self, box):
+        """By central differences, also at the middle, where the value before tanh changes sign."""
+        low, high = box
+        dist = TanhGaussianMixture(*random_parameters(dim=1), low=low, high=high)
+        fractions = torch.tensor([0.01, 0.3, 0.5, 0.7, 0.99], dtype=torch.float64)
+        action = (low + (high - low) * fractions).unsqueeze(-1).requires_grad_()
+        (slope,) = torch.autograd.grad(dist.log_prob(action).sum(), action)
+        step = 1e-5 * (high - low)
+        above, below = (dist.log_prob(action.detach() + h) for h in (step, -step))
+        torch.testing.assert_close(
+            slope.squeeze(-1), (above - below) / (2 * step), rtol=1e-4, atol=0
+        )
+
+    @pytest.mark.parametrize("given", ["number", "tensor"])
+    @pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float32])
+    def test_bounds_are_rounded_inwards(self, dtype, given):
+        """Otherwise a saturated action is outside the box of the environment."""
+        torch.manual_seed(0)
+        low, high = -0.3, 0.1  # float32 rounds both outwards
+        loc = torch.tensor([[40.0], [-40.0]], dtype=dtype)
+        bounds = (low, high)
+        if given == "tensor":
+            bounds = [torch.tensor([bound], dtype=torch.float64) for bound in bounds]
+        dist = TanhGaussianMixture(
+            torch.zeros(2, dtype=dtype), loc, torch.ones_like(loc), low=bounds[0], high=bounds[1]
+        )
+        action = dist.sample((100,))
+        assert action.dtype == dtype
+        assert action.double().min() >= low
+        assert action.double().max() <= high
+        assert dist.log_prob(action).isfinite().all()
+
+    def test_an_action_kept_in_fewer_digits(self):
+        """The type with fewer digits rounded it: of what is stored, or of the parameters."""
+        logits, loc, scale = random_parameters(dim=1)
+        dist = TanhGaussianMixture(logits, loc, scale)
+        last = torch.tensor([1.0]).nextafter(torch.tensor([0.0]))
+        assert dist.log_prob(torch.tensor([1.0])) == dist.log_prob(last.double())
+        single = TanhGaussianMixture(logits.float(), loc.float(), scale.float())
+        stored = torch.tensor([1.0])
+        score = single.log_prob(stored.double())
+        torch.testing.assert_close(score.float(), single.log_prob(stored))
+
     def test_saturated_actions_are_finite_with_finite_gradients(self):
         logits, loc, scale = random_parameters(2, dtype=torch.float32)
         parameters = [p.requires_grad_() for p in (logits, loc, scale)]

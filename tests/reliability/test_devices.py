@@ -29,7 +29,7 @@ from torchrl_safe import (
     TrustRegionSafeOptimizer,
     TsallisLoss,
 )
-from torchrl_safe.objectives.value import with_policy
+from torchrl_safe.objectives.value import PolicyEvaluation, evaluate_policy
 from torchrl_safe.record import read_metrics
 
 OBS, ACT = 3, 2
@@ -89,14 +89,14 @@ def draw_blocks(device: str) -> tuple[GMMTanhPolicy, TsallisLoss, CVaRCostLoss]:
 
 
 def make_data(batch: tuple[int, int] = (6, 7)) -> TensorDict:
-    """Trajectories with the draws of the policy in them, which differ between devices."""
+    """Trajectories."""
     generator = torch.Generator().manual_seed(1)
 
     def rand(*shape: int) -> torch.Tensor:
         return torch.randn(*batch, *shape, generator=generator, dtype=torch.float64)
 
     done = rand(1) > 1
-    data = TensorDict(
+    return TensorDict(
         {
             "observation": rand(OBS),
             "action": rand(ACT).tanh(),
@@ -111,8 +111,13 @@ def make_data(batch: tuple[int, int] = (6, 7)) -> TensorDict:
         },
         batch,
     )
+
+
+def evaluate(data: TensorDict, device: str) -> PolicyEvaluation:
+    """The policy on the data, with draws that do not differ between devices."""
     torch.manual_seed(2)
-    return with_policy(data, make_blocks("cpu")[0])
+    evaluation = evaluate_policy(data, make_blocks("cpu")[0])
+    return PolicyEvaluation(*(tensor.to(device) for tensor in evaluation))
 
 
 def make_closure(policy, reward_loss, cost_loss, states, noise, distance=MOMENT_MATCHED):
@@ -139,8 +144,10 @@ def learn(device: str, distance: Distance) -> dict[str, torch.Tensor]:
     noise = torch.utils._pytree.tree_map_only(torch.Tensor, lambda x: x.to(device), noise)
     out = {"log_prob": dist.log_prob(data["action"]), "action": dist.rsample(noise=noise)}
     out["mean"], out["cov"] = dist.moments
-    out["reward_target"] = reward_loss.compute_target(data)
-    out["cost_target"], out["std_target"] = cost_loss.compute_target(data)
+    evaluation = evaluate(make_data(), device)
+    out["value_target"] = reward_loss.compute_target(data, policy=evaluation)
+    out["cost_target"], out["std_target"] = cost_loss.compute_target(data, policy=evaluation)
+    data.update({name: out[name] for name in ("value_target", "cost_target", "std_target")})
     losses = cost_loss(data)
     losses["loss_qvalue"], _ = reward_loss.qvalue_v2_loss(data)
     sum(losses[f"loss_{name}"] for name in ("qvalue", "cost_value", "cost_std")).backward()
@@ -186,9 +193,10 @@ def make_critics_update(device: str) -> Callable[[], None]:
     optim = torch.optim.Adam(params, fused=True)
 
     def update() -> None:
-        part = with_policy(data, policy)
-        part.set("value_target", reward_loss.compute_target(part))
-        cost_target, std_target = cost_loss.compute_target(part)
+        evaluation = evaluate_policy(data, policy)
+        part = data.copy()
+        part.set("value_target", reward_loss.compute_target(part, policy=evaluation))
+        cost_target, std_target = cost_loss.compute_target(part, policy=evaluation)
         part.update({"cost_target": cost_target, "std_target": std_target})
         losses = cost_loss(part)
         loss = losses["loss_cost_value"] + losses["loss_cost_std"]

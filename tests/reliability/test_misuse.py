@@ -551,13 +551,23 @@ for function in (value.retrace_variance_reward, value.squared_td_error):
         "torch.float32",
         "must be boolean",
     )
+for key in ("observation", "action"):
+    bad(
+        f"evaluate_policy: no {key}",
+        lambda key=key: value.evaluate_policy(data(key), policy()),
+        KeyError,
+        key,
+        "batch size (2, 4)",
+        "not in the tensordict",
+        state=weights(policy),
+    )
 bad(
-    "with_policy: no observation",
-    lambda: value.with_policy(data("observation"), policy()),
-    KeyError,
-    "observation",
-    "not found",
-    "action",
+    "evaluate_policy: time_dim",
+    lambda: value.evaluate_policy(data(), policy(), shifted=True, time_dim=2),
+    ValueError,
+    "time_dim",
+    "got 2",
+    "batch size (2, 4)",
     state=weights(policy),
 )
 

@@ -7,10 +7,10 @@ from typing import Any
 
 import torch
 from tensordict import NestedKey, TensorDictBase
-from tensordict.nn import InteractionType, TensorDictModule
+from tensordict.nn import InteractionType, ProbabilisticTensorDictModule, TensorDictModule
 from torch import Tensor, nn
 from torchrl.data import Bounded, TensorSpec
-from torchrl.modules import ProbabilisticActor
+from torchrl.modules import ProbabilisticActor, SafeProbabilisticModule
 
 from torchrl_safe.modules.distributions import Relaxation, TanhGaussianMixture
 
@@ -108,7 +108,9 @@ class GMMParamExtractor(nn.Module):
 class GMMTanhPolicy(ProbabilisticActor):
     """A stochastic actor whose action is a squashed Gaussian mixture, eqs. (11), (12) of SafeTAC.
 
-    Calling it draws exact actions and writes ``action`` and ``action_log_prob``. The distribution's
+    Calling it draws exact actions and writes ``action`` and ``action_log_prob``, which is
+    ``get_dist(td).log_prob(action)``: the ratio of a policy to itself is 1, however saturated it
+    is. The distribution's
     parameters stay out of the tensordict, hence out of the replay buffer; :meth:`get_dist` computes
     the distribution and leaves its input as it was.
 
@@ -182,15 +184,18 @@ class GMMTanhPolicy(ProbabilisticActor):
         # Complain about the arguments now and not at the first action.
         example = torch.ones(num_components, spec.shape[-1], device=spec.device)
         TanhGaussianMixture(example[:, 0], example, example, **distribution_kwargs)
-        super().__init__(
+        # As ProbabilisticActor's own constructor, with another last module.
+        super(ProbabilisticActor, self).__init__(
             TensorDictModule(_Headed(network, extractor), in_keys=in_keys, out_keys=parameters),
-            in_keys=parameters,
-            out_keys=out_keys,
-            spec=spec,
-            distribution_class=TanhGaussianMixture,
-            distribution_kwargs=distribution_kwargs,
-            default_interaction_type=InteractionType.RANDOM,
-            return_log_prob=return_log_prob,
+            _StoredAction(
+                in_keys=parameters,
+                out_keys=["action"] if out_keys is None else out_keys,
+                spec=spec,
+                distribution_class=TanhGaussianMixture,
+                distribution_kwargs=distribution_kwargs,
+                default_interaction_type=InteractionType.RANDOM,
+                return_log_prob=return_log_prob,
+            ),
         )
         self.select_out_keys(*self[-1].out_keys)
 
@@ -202,6 +207,16 @@ class GMMTanhPolicy(ProbabilisticActor):
     ) -> TanhGaussianMixture:
         """Return the action distribution at ``tensordict``, which is left as it was."""
         return super().get_dist(tensordict.select(*self.in_keys), tensordict_out, **kwargs)
+
+
+class _StoredAction(SafeProbabilisticModule):
+    """Draws an action and scores it as it is stored, rounded by tanh.
+
+    TorchRL's own module scores the draw before tanh. Where tanh saturates, the policy's
+    ``log_prob`` of the stored action is another number, and the ratio of a policy to itself not 1.
+    """
+
+    forward = ProbabilisticTensorDictModule.forward
 
 
 class _Headed(nn.Sequential):

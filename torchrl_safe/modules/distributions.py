@@ -63,8 +63,8 @@ class TanhGaussianMixture(Distribution):
         scale (torch.Tensor): component standard deviations before tanh, shape ``[*B, K, D]``.
 
     Keyword Args:
-        low (float or torch.Tensor): lower action bound, broadcast to ``[*B, D]``.
-            Default: ``-1.0``.
+        low (float or torch.Tensor): lower action bound, broadcast to ``[*B, D]``. In the type of
+            the parameters it is rounded inwards, like ``high``. Default: ``-1.0``.
         high (float or torch.Tensor): upper action bound, broadcast to ``[*B, D]``.
             Default: ``1.0``.
         relaxation (str): how ``rsample`` carries a gradient. Default: ``"implicit"``.
@@ -125,8 +125,11 @@ class TanhGaussianMixture(Distribution):
         self.relaxation: Relaxation = relaxation
         self.temperature = temperature
         batch_shape, event_shape = logits.shape[:-1], loc.shape[-1:]
-        self.low = _bound("low", low, loc, batch_shape + event_shape)
-        self.high = _bound("high", high, loc, batch_shape + event_shape)
+        self.low, self.high = _round_inwards(
+            _bound("low", low, loc, batch_shape + event_shape),
+            _bound("high", high, loc, batch_shape + event_shape),
+            loc.dtype,
+        )
         if not (isinstance(low, Tensor) or isinstance(high, Tensor)) and not low < high:
             raise ValueError(f"low must be less than high, got low={low} and high={high}")
         super().__init__(batch_shape, event_shape, validate_args=validate_args)
@@ -185,12 +188,17 @@ class TanhGaussianMixture(Distribution):
         return new
 
     def log_prob(self, value: Tensor) -> Tensor:
-        r"""Score an action.
+        r"""Score a stored action: the one function behind every ratio of densities.
 
-        The action is mapped back by atanh. Where it has been rounded onto a bound the value before
-        tanh is lost, and the nearest representable action inside is scored (in float32 it has
-        :math:`|u| = 8.66`), with zero gradient with respect to the action. Score fresh draws with
-        ``sample_and_log_prob`` or ``rsample_and_log_prob``, which keep the value before tanh.
+        The action is mapped back by the inverse of tanh. One that has been rounded onto a bound, or
+        lies outside, has lost its value before tanh; the nearest action inside is scored, with zero
+        gradient with respect to the action. That is the next representable number, or the last one
+        that tanh reaches where a bound near zero has finer numbers than tanh (in float32,
+        :math:`|u| \le 8.66`).
+
+        Of a fresh draw, ``sample_and_log_prob`` and ``rsample_and_log_prob`` score the value before
+        tanh. Those scores belong into entropies, where rounding would make a saturated policy look
+        random, and not beside a stored action: the two differ where tanh saturates.
 
         Args:
             value (torch.Tensor): actions, shape ``[*S, *B, D]``.
@@ -205,9 +213,18 @@ class TanhGaussianMixture(Distribution):
             raise ValueError(f"value must have shape [..., {self._dim}], got {tuple(value.shape)}")
         if self._validate_args:
             self._validate_sample(value)
-        inside = 1 - torch.finfo(value.dtype).eps / 2
-        unit = (2 * value - (self.high + self.low)) / (self.high - self.low)
-        return self._log_prob(torch.atanh(unit.clamp(-inside, inside)).movedim(-1, 0).contiguous())
+        low, high, first, last = (
+            bound[(None,) * (value.ndim - bound.ndim)].movedim(-1, 0)
+            for bound in (self.low, self.high, *self._interior(value.dtype))
+        )
+        value = value.movedim(-1, 0).contiguous().clamp(first, last)
+        # Differences of neighbouring floats are exact, so that no digit is lost beside a bound.
+        below, above = value - low, high - value
+        offset = 2 * value - (high + low)
+        side = torch.ones_like(offset).copysign(offset.detach())
+        latent = 0.5 * side * torch.log1p(side * offset / torch.minimum(below, above))
+        log_slope = (2 * below * (above / (high - low))).log()
+        return self._log_density(latent) - log_slope.sum(0)
 
     def sample(self, sample_shape: _Shape = ()) -> Tensor:
         """Draw actions exactly, without a pathwise gradient, shape ``[*S, *B, D]``."""
@@ -215,7 +232,9 @@ class TanhGaussianMixture(Distribution):
             return self._squash(self._draw(sample_shape))
 
     def sample_and_log_prob(self, sample_shape: _Shape = ()) -> tuple[Tensor, Tensor]:
-        """Draw actions exactly and score them on the value before tanh.
+        """Draw actions exactly and score them on the value before tanh, as entropies need it.
+
+        Where an action is stored, its score is :meth:`log_prob` of it.
 
         Args:
             sample_shape (torch.Size): leading shape ``S``.
@@ -331,11 +350,23 @@ class TanhGaussianMixture(Distribution):
 
     def _log_prob(self, latent: Tensor) -> Tensor:
         """Log-density of the action at its value before tanh ``[D, *S, *B]``."""
-        log_jacobian = 2 * (math.log(2) - latent - F.softplus(-2 * latent))
+        log_slope = 2 * (math.log(2) - latent - F.softplus(-2 * latent))
+        log_width = ((self.high - self.low) / 2).log().sum(-1)
+        return self._log_density(latent) - log_slope.sum(0) - log_width
+
+    def _log_density(self, latent: Tensor) -> Tensor:
+        """Log-density before tanh at ``[D, *S, *B]``."""
+        return _mixture_log_density(*self._components_first(latent.ndim), latent)
+
+    def _interior(self, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
+        """First and last action inside the box that acting reaches, in numbers of ``dtype``."""
+        # Of a stored action and the parameters, the type with fewer digits rounded the action.
+        dtype = max(dtype, self.loc.dtype, key=lambda dtype: torch.finfo(dtype).eps)
+        low, high = _round_inwards(self.low, self.high, dtype)
+        margin = (self.high - self.low) * (torch.finfo(dtype).eps / 4)
         return (
-            _mixture_log_density(*self._components_first(latent.ndim), latent)
-            - log_jacobian.sum(0)
-            - ((self.high - self.low) / 2).log().sum(-1)
+            torch.nextafter(low, high).maximum(self.low + margin),
+            torch.nextafter(high, low).minimum(self.high - margin),
         )
 
     def _squash(self, latent: Tensor) -> Tensor:
@@ -484,15 +515,26 @@ def _tail_sign(normal: Tensor) -> Tensor:
 
 
 def _bound(name: str, value: float | Tensor, like: Tensor, shape: torch.Size) -> Tensor:
-    """A bound on the device and in the type of the parameters, shape ``[..., D]``."""
+    """A bound on the device of the parameters, shape ``[..., D]``."""
     if not isinstance(value, Tensor):
         if not math.isfinite(value):
             raise ValueError(f"{name} must be finite, got {value}")
         # A fill, not a copy from the host: on an accelerator it does not wait.
-        return like.new_full(shape[-1:], value)
+        return like.new_full(shape[-1:], value, dtype=torch.float64)
     pairs = zip(reversed(value.shape), reversed(shape), strict=False)
     if value.ndim > len(shape) or any(size not in (1, full) for size, full in pairs):
         raise ValueError(
             f"{name} must broadcast to [*B, D] = {tuple(shape)}, got shape {tuple(value.shape)}"
         )
-    return value.to(like).expand(*value.shape[:-1], shape[-1])
+    return value.to(like.device).expand(*value.shape[:-1], shape[-1])
+
+
+def _round_inwards(low: Tensor, high: Tensor, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
+    """Bounds as numbers of ``dtype`` that are not outside the box."""
+    if low.dtype == high.dtype == dtype:
+        return low, high
+    lower, upper = low.to(dtype), high.to(dtype)
+    return (
+        torch.where(lower < low, torch.nextafter(lower, upper), lower),
+        torch.where(upper > high, torch.nextafter(upper, lower), upper),
+    )

@@ -22,6 +22,7 @@ from torchrl.objectives.value import ValueEstimatorBase
 from torchrl_safe.objectives.functional import check_regression, check_risk_level, gaussian_cvar
 from torchrl_safe.objectives.utils import ensemble
 from torchrl_safe.objectives.value import (
+    PolicyEvaluation,
     RetraceEstimator,
     retrace_variance_reward,
     squared_td_error,
@@ -339,12 +340,18 @@ class CVaRCostLoss(LossModule):
         )
         return td_out
 
-    def compute_target(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor]:
+    def compute_target(
+        self, tensordict: TensorDictBase, *, policy: PolicyEvaluation | None = None
+    ) -> tuple[Tensor, Tensor]:
         """Retrace targets of both critics (18).
 
         Args:
-            tensordict (TensorDictBase): trajectories ``[*B, T]``; those of
-                :func:`~torchrl_safe.objectives.value.with_policy` spare evaluating the policy.
+            tensordict (TensorDictBase): trajectories ``[*B, T]``.
+
+        Keyword Args:
+            policy (PolicyEvaluation, optional): what
+                :func:`~torchrl_safe.objectives.value.evaluate_policy` returned for the tensordict
+                and the policy of now. Spares evaluating the policy here.
 
         Returns:
             Targets of the mean and of the standard deviation, without gradient, each of the
@@ -358,10 +365,10 @@ class CVaRCostLoss(LossModule):
         next_tensordict = tensordict.get("next")
         critics = (self.target_cost_network_params, self.target_std_network_params)
         with torch.no_grad(), set_exploration_type(ExplorationType.RANDOM):
-            next_action = next_tensordict.get("policy_action", None)
-            if next_action is None:
+            if policy is None:
                 next_action, _ = sample_and_log_prob(self._target_dist(next_tensordict))
-            action = tensordict.get(keys.action)
+            else:
+                next_action = policy.next_action
             data = tensordict.select(
                 keys.log_prob,
                 *(_next(key) for key in (keys.cost, keys.done, keys.terminated)),
@@ -377,24 +384,26 @@ class CVaRCostLoss(LossModule):
                     self._inputs(next_tensordict, next_action), *critics
                 )
             )
+            options = {}
             if isinstance(estimator, RetraceEstimator):
-                log_prob = tensordict.get(estimator_keys.policy_log_prob, None)
-                if log_prob is None:
-                    log_prob = self._target_dist(tensordict).log_prob(action)
-                data.set(estimator_keys.policy_log_prob, log_prob)
+                if policy is None:
+                    log_prob = self._target_dist(tensordict).log_prob(tensordict.get(keys.action))
+                else:
+                    log_prob = policy.log_prob
+                options["policy_log_prob"] = log_prob
             cost = data.get(_next(keys.cost))
             terminated = data.get(_next(keys.terminated), data.get(_next(keys.done)))
 
             data.set(action_value_key, mean)
             data.set(_next(estimator_keys.value), next_mean)
-            mean_target = estimator.value_estimate(data)
+            mean_target = estimator.value_estimate(data, **options)
 
             variance_reward = VARIANCE_REWARDS[self.variance_reward]
             reward = variance_reward(estimator.gamma, cost, mean, next_mean, terminated)
             data.set(_next(keys.cost), reward)
             data.set(action_value_key, std.square())
             data.set(_next(estimator_keys.value), next_std.square())
-            variance_target = self._variance_estimator.value_estimate(data)
+            variance_target = self._variance_estimator.value_estimate(data, **options)
         # Trace corrections can make a sampled target of a variance negative.
         return mean_target, variance_target.clamp(min=0).sqrt()
 

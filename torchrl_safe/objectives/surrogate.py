@@ -25,6 +25,7 @@ from torchrl_safe.objectives.value import (
     retrace_variance_reward,
     squared_td_error,
 )
+from torchrl_safe.objectives.value.utils import get_entry
 
 
 class CostMoments(NamedTuple):
@@ -88,10 +89,20 @@ class _SurrogateLoss(LossModule):
         with getattr(self, f"{name}_params").to_module(network):
             return network(tensordict.select(*network.in_keys)).get(key)
 
+    def _scored(self, tensordict: TensorDictBase, policy_log_prob: Tensor | None) -> TensorDictBase:
+        """A shallow copy in which the policy that advantages belong to is the given one."""
+        if policy_log_prob is None:
+            policy_log_prob = get_entry(
+                tensordict,
+                self.tensor_keys.log_prob,
+                "the log-density of the action under the policy that took it, [*B, T]",
+            )
+        return tensordict.copy().set(self.tensor_keys.policy_log_prob, policy_log_prob)
+
     def _log_probs(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor]:
         """Log-densities of the stored action under the policy and under its sampler, [*B]."""
-        log_mu = tensordict.get(self.tensor_keys.log_prob)
-        return tensordict.get(self.tensor_keys.policy_log_prob, log_mu), log_mu
+        keys = self.tensor_keys
+        return self._computed(tensordict, keys.policy_log_prob), tensordict.get(keys.log_prob)
 
     def _advantage(
         self,
@@ -104,7 +115,6 @@ class _SurrogateLoss(LossModule):
         log_pi, log_mu = self._log_probs(tensordict)
         data = TensorDict(
             {
-                "policy_log_prob": log_pi,
                 "action_log_prob": log_mu,
                 "state_action_value": value,
                 "next": {
@@ -116,7 +126,7 @@ class _SurrogateLoss(LossModule):
             },
             tensordict.batch_size,
         )
-        return estimator.value_estimate(data) - value
+        return estimator.value_estimate(data, policy_log_prob=log_pi) - value
 
     def _terminated(self, tensordict: TensorDictBase) -> Tensor:
         done = tensordict.get(("next", self.tensor_keys.done))
@@ -166,9 +176,9 @@ class ReturnSurrogateLoss(_SurrogateLoss):
         reduction (str): ``"mean"``, ``"sum"`` or ``"none"``. Defaults to ``"mean"``.
 
     .. note::
-        Data of the policy itself need ``"action_log_prob"``. Data of older policies also need
-        ``"policy_log_prob"``, the log-density of the stored action under the policy of now:
-        advantages are then corrected as in Retrace.
+        Data of the policy itself need ``"action_log_prob"``. With data of older policies,
+        :meth:`compute_advantage` also needs the log-density of the stored action under the policy
+        of now: advantages are then corrected as in Retrace.
 
     Examples:
         >>> import torch
@@ -202,8 +212,8 @@ class ReturnSurrogateLoss(_SurrogateLoss):
         Attributes:
             log_prob (NestedKey): Log-density of the action under the policy that took it.
                 Defaults to ``"action_log_prob"``.
-            policy_log_prob (NestedKey): Under the current policy, if that is another one.
-                Defaults to ``"policy_log_prob"``.
+            policy_log_prob (NestedKey): Under the policy that advantages belong to, an output of
+                :meth:`compute_advantage`. Defaults to ``"policy_log_prob"``.
             reward (NestedKey): Under ``"next"``. Defaults to ``"reward"``.
             value (NestedKey): Output of the critic. Defaults to ``"state_value"``.
             advantage (NestedKey): Defaults to ``"advantage"``.
@@ -246,25 +256,32 @@ class ReturnSurrogateLoss(_SurrogateLoss):
         self.make_value_estimator()
 
     @torch.no_grad()
-    def compute_advantage(self, tensordict: TensorDictBase) -> TensorDictBase:
+    def compute_advantage(
+        self, tensordict: TensorDictBase, *, policy_log_prob: Tensor | None = None
+    ) -> TensorDictBase:
         """Advantages and the critic's targets.
 
         Args:
             tensordict (TensorDictBase): trajectories ``[*B, T]``.
 
+        Keyword Args:
+            policy_log_prob (Tensor, optional): log-density of the stored action under the policy
+                of now, ``[*B, T]``, if another one took it.
+
         Returns:
-            A shallow copy with ``"advantage"`` and ``"value_target"``, ``[*B, T, 1]``.
+            A shallow copy with ``"advantage"`` and ``"value_target"``, ``[*B, T, 1]``, and
+            ``"policy_log_prob"``, ``[*B, T]``.
         """
         keys = self.tensor_keys
+        out = self._scored(tensordict, policy_log_prob)
         value, next_value = (
             self._value("value_network", keys.value, states)
             for states in (tensordict, tensordict.get("next"))
         )
         reward = tensordict.get(("next", keys.reward))
-        advantage = self._advantage(self._value_estimator, tensordict, reward, value, next_value)
-        out = tensordict.copy()
+        advantage = self._advantage(self._value_estimator, out, reward, value, next_value)
         out.set(keys.advantage, advantage)
-        out.set(keys.value_target, value + self._weight(tensordict) * advantage)
+        out.set(keys.value_target, value + self._weight(out) * advantage)
         return out
 
     @dispatch
@@ -400,8 +417,8 @@ class CVaRSurrogateLoss(_SurrogateLoss):
         Attributes:
             log_prob (NestedKey): Log-density of the action under the policy that took it.
                 Defaults to ``"action_log_prob"``.
-            policy_log_prob (NestedKey): Under the current policy, if that is another one.
-                Defaults to ``"policy_log_prob"``.
+            policy_log_prob (NestedKey): Under the policy that advantages belong to, an output of
+                :meth:`compute_advantage`. Defaults to ``"policy_log_prob"``.
             cost (NestedKey): Cost of a step, under ``"next"``. Defaults to ``"cost"``.
             cost_value (NestedKey): Output of the critic of the mean. Defaults to ``"cost_value"``.
             cost_variance (NestedKey): Output of the critic of the variance.
@@ -475,7 +492,9 @@ class CVaRSurrogateLoss(_SurrogateLoss):
         self._square_estimator = RetraceEstimator(gamma=gamma**2, lmbda=lmbda)
 
     @torch.no_grad()
-    def compute_advantage(self, tensordict: TensorDictBase) -> TensorDictBase:
+    def compute_advantage(
+        self, tensordict: TensorDictBase, *, policy_log_prob: Tensor | None = None
+    ) -> TensorDictBase:
         r"""Advantages of both moments and the critics' targets.
 
         The variance :math:`V` obeys the recursion of the mean at discount ``gamma ** 2`` with the
@@ -485,11 +504,17 @@ class CVaRSurrogateLoss(_SurrogateLoss):
         Args:
             tensordict (TensorDictBase): trajectories ``[*B, T]``.
 
+        Keyword Args:
+            policy_log_prob (Tensor, optional): log-density of the stored action under the policy
+                of now, ``[*B, T]``, if another one took it.
+
         Returns:
             A shallow copy with ``"cost_value"``, ``"cost_advantage"``, ``"square_advantage"``,
-            ``"cost_target"`` and ``"variance_target"``, ``[*B, T, 1]``.
+            ``"cost_target"`` and ``"variance_target"``, ``[*B, T, 1]``, and
+            ``"policy_log_prob"``, ``[*B, T]``.
         """
         keys = self.tensor_keys
+        out = self._scored(tensordict, policy_log_prob)
         mean, next_mean = (
             self._value("cost_network", keys.cost_value, states)
             for states in (tensordict, tensordict.get("next"))
@@ -499,17 +524,14 @@ class CVaRSurrogateLoss(_SurrogateLoss):
             for states in (tensordict, tensordict.get("next"))
         )
         cost = tensordict.get(("next", keys.cost))
-        advantage = self._advantage(self._value_estimator, tensordict, cost, mean, next_mean)
+        advantage = self._advantage(self._value_estimator, out, cost, mean, next_mean)
 
         def second_order(reward: Callable[..., Tensor]) -> Tensor:
             terminated = self._terminated(tensordict)
             rewards = reward(self.gamma, cost, mean, next_mean, terminated)
-            return self._advantage(
-                self._square_estimator, tensordict, rewards, variance, next_variance
-            )
+            return self._advantage(self._square_estimator, out, rewards, variance, next_variance)
 
-        weight = self._weight(tensordict)
-        out = tensordict.copy()
+        weight = self._weight(out)
         out.set(keys.cost_value, mean)
         out.set(keys.cost_advantage, advantage)
         out.set(keys.square_advantage, second_order(retrace_variance_reward))

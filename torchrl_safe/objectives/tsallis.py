@@ -22,6 +22,7 @@ from torchrl_safe.objectives.functional import (
     uniform_tsallis_entropy,
 )
 from torchrl_safe.objectives.utils import ensemble
+from torchrl_safe.objectives.value import PolicyEvaluation, RetraceEstimator
 
 
 class TsallisLoss(SACLoss):
@@ -237,13 +238,19 @@ class TsallisLoss(SACLoss):
             )
         return value - self._alpha * q_logarithm(log_prob, self.entropic_index)
 
-    def compute_target(self, tensordict: TensorDictBase) -> Tensor:
+    def compute_target(
+        self, tensordict: TensorDictBase, *, policy: PolicyEvaluation | None = None
+    ) -> Tensor:
         """Target of the Q-value (4), from the loss's value estimator.
 
         Args:
             tensordict (TensorDictBase): transitions ``[*B]``, or trajectories ``[*B, T]`` where
-                the value estimator looks further than one step; those of
-                :func:`~torchrl_safe.objectives.value.with_policy` spare evaluating the policy.
+                the value estimator looks further than one step.
+
+        Keyword Args:
+            policy (PolicyEvaluation, optional): what
+                :func:`~torchrl_safe.objectives.value.evaluate_policy` returned for the tensordict
+                and the policy of now. Spares evaluating the policy here.
 
         Returns:
             The target without gradient, of the shape of the reward, ``[*B, 1]``.
@@ -260,8 +267,14 @@ class TsallisLoss(SACLoss):
             if self.skip_done_states:
                 alive = ~next_tensordict.get(self.tensor_keys.terminated).squeeze(-1)
                 states = next_tensordict[alive]
-            action, log_prob = (states.get(f"policy_{k}", None) for k in ("action", "log_prob"))
-            if action is None or log_prob is None:
+            options = {}
+            if policy is not None:
+                action, log_prob = policy.next_action, policy.next_log_prob
+                if alive is not None:
+                    action, log_prob = action[alive], log_prob[alive]
+                if isinstance(self.value_estimator, RetraceEstimator):
+                    options["policy_log_prob"] = policy.log_prob
+            else:
                 with self.target_actor_network_params.to_module(
                     self.actor_network, preserve_module_state=False
                 ):
@@ -271,7 +284,7 @@ class TsallisLoss(SACLoss):
             if alive is not None:
                 value = value.new_zeros(alive.shape).masked_scatter_(alive, value)
             next_tensordict.set(self.value_estimator.tensor_keys.value, value.unsqueeze(-1))
-            return self.value_estimator.value_estimate(tensordict)
+            return self.value_estimator.value_estimate(tensordict, **options)
 
     def qvalue_v2_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
         """Regression of every Q-value network on the target.

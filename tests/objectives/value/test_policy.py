@@ -9,7 +9,7 @@ from torchrl.modules import MLP, NormalParamExtractor, ProbabilisticActor, TanhN
 from torchrl.modules.tensordict_module import SafeModule
 
 from torchrl_safe import CVaRCostLoss, GMMTanhPolicy, TsallisLoss
-from torchrl_safe.objectives.value import with_policy
+from torchrl_safe.objectives.value import evaluate_policy
 
 OBS, ACT = 3, 2
 SPEC = Bounded(-1, 1, (ACT,))
@@ -61,30 +61,21 @@ def slices():
 
 @pytest.mark.parametrize("shifted", [False, True])
 @pytest.mark.parametrize("make_actor", [mixture_actor, tanh_normal_actor])
-def test_entries_are_those_of_the_policy(slices, make_actor, shifted):
+def test_terms_are_those_of_the_policy(slices, make_actor, shifted):
     actor = make_actor()
     before = slices.clone()
-    out = with_policy(slices, actor, shifted=shifted)
+    log_prob, next_action, next_log_prob = evaluate_policy(slices, actor, shifted=shifted)
     assert (slices == before).all()
     assert set(slices.keys(True)) == set(before.keys(True))
     with torch.no_grad():
-        log_prob = actor.get_dist(slices).log_prob(slices["action"])
+        expected = actor.get_dist(slices).log_prob(slices["action"])
         next_dist = actor.get_dist(slices["next"])
-    torch.testing.assert_close(out["policy_log_prob"], log_prob)
-    torch.testing.assert_close(
-        out["next", "policy_log_prob"],
-        next_dist.log_prob(out["next", "policy_action"]),
-        rtol=1e-3,
-        atol=1e-3,
-    )
-    assert not out["policy_log_prob"].requires_grad
+    torch.testing.assert_close(log_prob, expected)
+    torch.testing.assert_close(next_log_prob, next_dist.log_prob(next_action), rtol=1e-3, atol=1e-3)
+    assert not log_prob.requires_grad
 
 
-@pytest.mark.parametrize("shifted", [False, True])
-@pytest.mark.parametrize("loss_class", [TsallisLoss, CVaRCostLoss])
-def test_targets_are_the_same(slices, loss_class, shifted):
-    """With one draw of the next actions: each loss's own evaluation is the reference."""
-    actor = mixture_actor()
+def make_loss(loss_class, actor):
     if loss_class is TsallisLoss:
         loss = TsallisLoss(actor, critic("state_action_value"), delay_qvalue=False)
         loss.make_value_estimator("retrace", gamma=0.9, lmbda=0.8)
@@ -92,14 +83,51 @@ def test_targets_are_the_same(slices, loss_class, shifted):
         last = nn.Softplus()
         loss = CVaRCostLoss(actor, critic("cost_value"), critic("cost_std", last), cost_limit=1.0)
         loss.make_value_estimator(gamma=0.9, lmbda=0.8)
+    return loss
+
+
+@pytest.mark.parametrize("shifted", [False, True])
+@pytest.mark.parametrize("loss_class", [TsallisLoss, CVaRCostLoss])
+def test_targets_are_the_same(slices, loss_class, shifted):
+    """With one draw of the next actions: each loss's own evaluation is the reference."""
+    actor = mixture_actor()
+    loss = make_loss(loss_class, actor)
     torch.manual_seed(1)
     expected = loss.compute_target(slices)
     torch.manual_seed(1)
-    shared = with_policy(slices, actor, shifted=shifted)
+    policy = evaluate_policy(slices, actor, shifted=shifted)
     state = torch.get_rng_state()
-    target = loss.compute_target(shared)
+    target = loss.compute_target(slices, policy=policy)
     torch.testing.assert_close(target, expected)
     assert (torch.get_rng_state() == state).all()  # no draw of its own
+
+
+def test_a_target_of_one_step_takes_the_draws(slices):
+    actor = mixture_actor()
+    loss = TsallisLoss(actor, critic("state_action_value"), delay_qvalue=False)
+    loss.make_value_estimator(gamma=0.9)
+    policy = evaluate_policy(slices, actor)
+    target = loss.compute_target(slices, policy=policy)
+    expected = slices["next", "reward"] + 0.9 * (
+        loss.objective(slices["next"], policy.next_action, policy.next_log_prob).unsqueeze(-1)
+    )
+    torch.testing.assert_close(target, expected)
+
+
+@pytest.mark.parametrize("loss_class", [TsallisLoss, CVaRCostLoss])
+def test_entries_of_a_past_policy_are_not_read(slices, loss_class):
+    """Whatever evaluations are stored, a target follows the policy of now."""
+    actor = mixture_actor()
+    loss = make_loss(loss_class, actor)
+    past = evaluate_policy(slices, actor)
+    stale = slices.copy()
+    stale["policy_log_prob"] = past.log_prob - 3.0
+    stale["next", "policy_action"] = past.next_action
+    stale["next", "policy_log_prob"] = past.next_log_prob
+    torch.manual_seed(1)
+    expected = loss.compute_target(slices)
+    torch.manual_seed(1)
+    torch.testing.assert_close(loss.compute_target(stale), expected)
 
 
 def test_a_shift_across_episodes_would_differ(slices):
@@ -107,13 +135,39 @@ def test_a_shift_across_episodes_would_differ(slices):
     actor = mixture_actor()
     slices["next", "observation"][:, 3] += 1.0
     torch.manual_seed(1)
-    one = with_policy(slices, actor)
+    one = evaluate_policy(slices, actor)
     torch.manual_seed(1)
-    two = with_policy(slices, actor, shifted=True)
-    assert (one["next", "policy_action"] != two["next", "policy_action"])[:, 3].any()
+    two = evaluate_policy(slices, actor, shifted=True)
+    assert (one.next_action != two.next_action)[:, 3].any()
+
+
+@pytest.mark.parametrize("how", ["name", "argument"])
+@pytest.mark.parametrize("shifted", [False, True])
+def test_time_may_be_any_dimension(slices, shifted, how):
+    actor = mixture_actor()
+    last = slices.transpose(0, 1).contiguous()
+    last.names = [None, None] if how == "argument" else ["time", None]
+    time_dim = 0 if how == "argument" else None
+    log_prob, next_action, next_log_prob = evaluate_policy(
+        last, actor, shifted=shifted, time_dim=time_dim
+    )
+    expected = evaluate_policy(slices, actor).log_prob
+    torch.testing.assert_close(log_prob, expected.transpose(0, 1))
+    # The draws are others, but of the distribution at their own state.
+    with torch.no_grad():
+        own = actor.get_dist(last["next"]).log_prob(next_action)
+    torch.testing.assert_close(next_log_prob, own, rtol=1e-3, atol=1e-3)
+
+
+@pytest.mark.parametrize("shifted", [False, True])
+def test_next_states_that_were_not_kept(slices, shifted):
+    """NaN at a trajectory's end: the state before it takes its place."""
+    slices["next", "observation"][:, -1] = torch.nan
+    policy = evaluate_policy(slices, mixture_actor(), shifted=shifted)
+    assert all(term.isfinite().all() for term in policy)
 
 
 @pytest.mark.parametrize("key", ["observation", "action", ("next", "observation")])
 def test_missing_entries(slices, key):
-    with pytest.raises(KeyError, match=key if isinstance(key, str) else key[-1]):
-        with_policy(slices.exclude(key), mixture_actor())
+    with pytest.raises(KeyError, match=f"{key[-1] if isinstance(key, tuple) else key}.*(5, 8)"):
+        evaluate_policy(slices.exclude(key), mixture_actor())

@@ -11,15 +11,16 @@ from torchrl_safe.objectives.value.functional import (
     squared_td_error,
     tree_backup_lambda_return_estimate,
 )
-from torchrl_safe.objectives.value.policy import with_policy
+from torchrl_safe.objectives.value.policy import PolicyEvaluation, evaluate_policy
 
 __all__ = [
+    "PolicyEvaluation",
     "RetraceEstimator",
+    "evaluate_policy",
     "importance_sampling_lambda_return_estimate",
     "q_lambda_return_estimate",
     "retrace_lambda_return_estimate",
     "retrace_variance_reward",
     "squared_td_error",
     "tree_backup_lambda_return_estimate",
-    "with_policy",
 ]

@@ -27,6 +27,7 @@ from torchrl.objectives.value.advantages import (
 )
 
 from torchrl_safe.objectives.value.functional import retrace_lambda_return_estimate
+from torchrl_safe.objectives.value.utils import get_entry, get_time_dim, repair_next
 
 if TYPE_CHECKING:
     from torchrl.objectives import LossModule
@@ -45,17 +46,17 @@ class RetraceEstimator(ValueEstimatorBase):
     * reward, ``done`` and ``terminated``: under ``"next"``; ``terminated`` falls back to ``done``;
     * log-density of the stored action under the policy that took it: ``"action_log_prob"``, or
       the actor's own key for it. It cannot be computed;
-    * log-density of the stored action under the current policy: ``"policy_log_prob"``, or from
-      ``actor_network``. Nothing but a caller writes that entry, so that it is used if present
-      unless ``skip_existing=False``;
+    * log-density of the stored action under the current policy: the argument ``policy_log_prob``,
+      or from ``actor_network``, or ``"policy_log_prob"``;
     * Q(s, a) of the stored action: from ``qvalue_network``, or ``"state_action_value"``;
     * value of the next state: from ``value_network``, else from ``qvalue_network`` at
       actions of ``actor_network``, or ``("next", "state_value")``. With an ``action_space`` of
       discrete actions the expectation over them is exact; otherwise it is a mean over
       ``num_next_actions`` draws.
 
-    Values that are present are used where there is no network to compute them, or if
-    ``skip_existing``. What networks compute has no gradient.
+    Entries are used where there is no network to compute them, or if ``skip_existing``: what
+    belongs to a policy or a critic of the past does not take the place of that of now. What
+    networks compute has no gradient.
 
     A flat batch ``[B * T]`` of slices gives the same targets as ``[B, T]`` if ``done`` marks the
     end of every slice, as :class:`~torchrl.data.SliceSampler` does. Steps must follow each other in
@@ -361,6 +362,7 @@ class RetraceEstimator(ValueEstimatorBase):
         params: TensorDictBase | None = None,
         target_params: TensorDictBase | None = None,
         time_dim: int | None = None,
+        policy_log_prob: Tensor | None = None,
     ) -> TensorDictBase:
         """Write the target and its distance from the action value into the tensordict.
 
@@ -375,6 +377,9 @@ class RetraceEstimator(ValueEstimatorBase):
                 ``value_network`` if there is one, else of ``qvalue_network``, where they default
                 to ``params``.
             time_dim (int, optional): overrides the constructor's.
+            policy_log_prob (Tensor, optional): log-density of the stored action under the current
+                policy, ``[*B, T]``, such as that of
+                :func:`~torchrl_safe.objectives.value.evaluate_policy`.
 
         Returns:
             TensorDictBase: the input, with ``"value_target"`` and
@@ -390,7 +395,7 @@ class RetraceEstimator(ValueEstimatorBase):
                 "Retrace needs trajectories, and the tensordict has no dimension of time: "
                 f"batch_size={tuple(tensordict.batch_size)}."
             )
-        time_dim = self._get_time_dim(time_dim, tensordict)
+        time_dim = self._time_dim(tensordict, time_dim)
         data, valid = tensordict, None
         if self.shifted and self._computes(tensordict):
             if target_params is not None:
@@ -399,7 +404,7 @@ class RetraceEstimator(ValueEstimatorBase):
             target_value = value
             data = self._prepare_shifted_tensordict(tensordict, valid, time_dim)
         else:
-            log_pi = self._policy_log_prob(tensordict)
+            log_pi = self._policy_log_prob(tensordict, policy_log_prob)
             value = self._action_value(tensordict, params)
             critic_params = self._critic_params(target_params)
             if critic_params is None and self._loss_module is None:
@@ -421,6 +426,8 @@ class RetraceEstimator(ValueEstimatorBase):
         target_params: TensorDictBase | None = None,
         next_value: Tensor | None = None,
         time_dim: int | None = None,
+        *,
+        policy_log_prob: Tensor | None = None,
         **kwargs: Any,
     ) -> Tensor:
         """Return the target; the tensordict is left as it is.
@@ -432,6 +439,9 @@ class RetraceEstimator(ValueEstimatorBase):
                 which the minimum is taken.
             next_value (Tensor, optional): value of the next state, in the shape of the reward.
             time_dim (int, optional): overrides the constructor's.
+            policy_log_prob (Tensor, optional): log-density of the stored action under the current
+                policy, ``[*B, T]``, such as that of
+                :func:`~torchrl_safe.objectives.value.evaluate_policy`.
             **kwargs: unused, as in TorchRL's other estimators.
 
         Returns:
@@ -442,11 +452,11 @@ class RetraceEstimator(ValueEstimatorBase):
             ValueError: if shapes disagree.
         """
         critic_params = self._critic_params(target_params)
-        log_pi = self._policy_log_prob(tensordict)
+        log_pi = self._policy_log_prob(tensordict, policy_log_prob)
         action_value = self._action_value(tensordict, critic_params)
         if next_value is None:
             next_value = self._next_state_value(tensordict, target_params, critic_params)
-        time_dim = self._get_time_dim(time_dim, tensordict)
+        time_dim = self._time_dim(tensordict, time_dim)
         return self._target(tensordict, log_pi, action_value, next_value, time_dim)
 
     def _target(
@@ -458,7 +468,7 @@ class RetraceEstimator(ValueEstimatorBase):
         time_dim: int,
     ) -> Tensor:
         keys = self.tensor_keys
-        reward = _get(tensordict, ("next", keys.reward), "the reward")
+        reward = get_entry(tensordict, ("next", keys.reward), "the reward")
         gamma = self.gamma
         steps = tensordict.get(keys.steps_to_next_obs, None)
         if steps is not None:
@@ -469,7 +479,7 @@ class RetraceEstimator(ValueEstimatorBase):
                 reward = (reward - reward.mean()) / reward.std().clamp_min(1e-4)
             else:
                 reward = _standardize_by_group(reward, groups)
-        log_mu = _get(
+        log_mu = get_entry(
             tensordict,
             keys.sample_log_prob,
             "the log-density of the action under the policy that took it (collect with an actor "
@@ -483,11 +493,14 @@ class RetraceEstimator(ValueEstimatorBase):
             action_value,
             next_value,
             reward,
-            _get(tensordict, ("next", keys.done), "the end of trajectories"),
+            get_entry(tensordict, ("next", keys.done), "the end of trajectories"),
             tensordict.get(unravel_key(("next", keys.terminated)), None),
             vectorized=self.vectorized,
             time_dim=time_dim,
         )
+
+    def _time_dim(self, tensordict: TensorDictBase, time_dim: int | None) -> int:
+        return get_time_dim(tensordict, self.time_dim if time_dim is None else time_dim)
 
     def _computes(self, tensordict: TensorDictBase) -> bool:
         """Whether networks have anything to do."""
@@ -498,10 +511,12 @@ class RetraceEstimator(ValueEstimatorBase):
         present = (tensordict.get(unravel_key(key), None) is not None for key in outputs)
         return not (skip_existing() and all(present))
 
-    def _policy_log_prob(self, tensordict: TensorDictBase) -> Tensor:
+    def _policy_log_prob(self, tensordict: TensorDictBase, given: Tensor | None) -> Tensor:
+        if given is not None:
+            return _with_feature(given, tensordict)
         key, actor = self.tensor_keys.policy_log_prob, self.actor_network
         has_density = hasattr(actor, "get_dist")
-        if self.skip_existing is not False or not has_density:
+        if skip_existing() or not has_density:
             log_prob = tensordict.get(key, None)
             if log_prob is not None:
                 return _with_feature(log_prob, tensordict)
@@ -512,7 +527,7 @@ class RetraceEstimator(ValueEstimatorBase):
                 f"it, got {type(actor).__name__}. In a loss, build the estimator with "
                 "RetraceEstimator.for_loss(loss, ...)."
             )
-        action = _get(tensordict, self.tensor_keys.action, "the stored action")
+        action = get_entry(tensordict, self.tensor_keys.action, "the stored action")
         with torch.no_grad():
             return _with_feature(self._policy(tensordict).log_prob(action), tensordict)
 
@@ -545,7 +560,7 @@ class RetraceEstimator(ValueEstimatorBase):
         """Q(s, a) from the values of all actions, where these are discrete."""
         if self.action_space is None:
             return value
-        action = _get(tensordict, self.tensor_keys.action, "the stored action")
+        action = get_entry(tensordict, self.tensor_keys.action, "the stored action")
         if self.action_space == "one_hot":
             return (value * action).sum(-1, keepdim=True)
         return value.gather(-1, _with_feature(action, tensordict))
@@ -573,10 +588,10 @@ class RetraceEstimator(ValueEstimatorBase):
             )
         with torch.no_grad():
             if self.value_network is not None:
-                tensordict = _repair_next(tensordict, self.value_network.in_keys)
+                tensordict = repair_next(tensordict, self.value_network.in_keys)
                 return self._next_value(tensordict, target_params, kwargs={})
             in_keys = [*self.actor_network.in_keys, *self.qvalue_network.in_keys]
-            following = _repair_next(tensordict, in_keys).get("next")
+            following = repair_next(tensordict, in_keys).get("next")
             return self._expected_value(self._policy(following), following, critic_params)
 
     def _expected_value(
@@ -615,7 +630,7 @@ class RetraceEstimator(ValueEstimatorBase):
 
         network = SimpleNamespace(in_keys=list({*actor.in_keys, *critic.in_keys, action_key}))
         values, next_values, valid = self._call_value_net_shifted(
-            _repair_next(tensordict, network.in_keys),
+            repair_next(tensordict, network.in_keys),
             params=None,
             next_params=None,
             value_key=self.tensor_keys.value,
@@ -639,7 +654,7 @@ class RetraceEstimator(ValueEstimatorBase):
             with _parameters(params, critic):
                 chunks = self._split_value_net_input(tensordict)
                 values = [
-                    _get(critic(chunk.copy()), key, "an output of qvalue_network")
+                    get_entry(critic(chunk.copy()), key, "an output of qvalue_network")
                     for chunk in chunks
                 ]
             return torch.cat(values, self._resolve_value_chunk_dim(tensordict.ndim))
@@ -674,36 +689,10 @@ def _parameters(params: TensorDictBase | None, module: TensorDictModule) -> Abst
     return params.to_module(module, preserve_module_state=False)
 
 
-def _get(tensordict: TensorDictBase, key: NestedKey, what: str) -> Tensor:
-    value = tensordict.get(unravel_key(key), None)
-    if value is None:
-        raise KeyError(f"{unravel_key(key)!r}, {what}, is not in the tensordict.")
-    return value
-
-
 def _select(tensordict: TensorDictBase, module: TensorDictModule, name: str) -> TensorDictBase:
     for key in module.in_keys:
-        _get(tensordict, key, f"an input of {name}")
+        get_entry(tensordict, key, f"an input of {name}")
     return tensordict.select(*module.in_keys)
-
-
-def _repair_next(tensordict: TensorDictBase, keys: list[NestedKey]) -> TensorDictBase:
-    """Next states that networks can take, in a shallow copy.
-
-    Collectors with ``compact_obs`` leave NaN at the end of a trajectory; the state before it takes
-    its place. A recurrent network starts anew where the trajectory does.
-    """
-    tensordict = tensordict.copy()
-    for key in keys:
-        next_key = unravel_key(("next", key))
-        value, following = tensordict.get(key, None), tensordict.get(next_key, None)
-        if value is None or following is None or value.shape != following.shape:
-            continue
-        if key == "is_init":
-            tensordict.set(next_key, value | following)
-        elif following.is_floating_point():
-            tensordict.set(next_key, torch.where(following.isnan(), value, following))
-    return tensordict
 
 
 def _with_feature(tensor: Tensor, tensordict: TensorDictBase) -> Tensor:

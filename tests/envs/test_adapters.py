@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
+from functools import partial
+
 import gymnasium
 import highway_env  # noqa: F401 (registers its environments)
 import numpy as np
@@ -10,6 +14,7 @@ import torch
 from torchrl.envs import (
     DMControlWrapper,
     GymEnv,
+    FrameSkipTransform,
     GymWrapper,
     RenameTransform,
     RewardSum,
@@ -20,7 +25,14 @@ from torchrl.envs import (
 from torchrl.envs.libs.safety_gymnasium import SafetyGymnasiumWrapper
 from torchrl.envs.utils import check_env_specs
 
-from torchrl_safe.envs import CostToReward, GymGoalEnv, check_safe_env, cost_from_info, suite
+from torchrl_safe.envs import (
+    CostToReward,
+    GymGoalEnv,
+    SafeFrameSkip,
+    check_safe_env,
+    cost_from_info,
+    suite,
+)
 
 POINT = "torchrl_safe/PointGoal-v0"
 
@@ -38,6 +50,28 @@ class SixTuple(gymnasium.Wrapper):
     def step(self, action):
         observation, reward, terminated, truncated, info = super().step(action)
         return observation, reward, info["cost"], terminated, truncated, info
+
+
+class NaNEnv(GymGoalEnv):
+    def step(self, action):
+        *out, info = super().step(action)
+        return *out, info | {"cost": float("nan")}
+
+
+@pytest.mark.parametrize("missing", ["mujoco.batch", "mujoco", "dm_control"])
+def test_without_the_simulator(missing):
+    """As beside an environment that pins an old MuJoCo, or none."""
+    code = f"""if True:
+        import sys
+        sys.modules[{missing!r}] = None
+        import gymnasium, torch
+        from torchrl.envs import GymEnv
+        from torchrl_safe.envs import CostToReward, SafeFrameSkip, check_safe_env, cost_from_info
+        assert {POINT!r} in gymnasium.registry
+        source = lambda info: 1.0
+        check_safe_env(cost_from_info(GymEnv("Pendulum-v1"), source))
+    """
+    subprocess.run([sys.executable, "-W", "ignore", "-c", code], check=True)
 
 
 class TestHighway:
@@ -108,8 +142,22 @@ class TestCostFromInfo:
     def test_missing_key(self):
         env = cost_from_info(GymEnv(POINT), "danger")
         td = env.reset()
-        with pytest.raises(KeyError, match=r"info has no 'danger', only .*'cost'"):
+        with pytest.raises(KeyError, match=r"info has no 'danger'; it has .*'cost'"):
             env.rand_step(td)
+
+    def test_takes_no_cost_of_a_reset(self):
+        env = cost_from_info(GymEnv(POINT))
+        assert "cost" not in env.reset().keys()
+        assert not env.reset()["violation"].any()
+
+    def test_observation_of_that_name(self):
+        class Shows(Reports):
+            observation_space = gymnasium.spaces.Dict({"cost": Reports.observation_space})
+
+        with pytest.raises(ValueError, match=r"has entries \['cost'\] of its own"):
+            cost_from_info(GymWrapper(Shows([])))
+        env = cost_from_info(GymWrapper(Shows([])), {"cash": "cost"})
+        assert "cash_cost" in env.full_reward_spec.keys()
 
     def test_rejects(self):
         with pytest.raises(TypeError, match="must be a GymWrapper or GymEnv, got DMControlWrapper"):
@@ -118,9 +166,176 @@ class TestCostFromInfo:
             cost_from_info(TransformedEnv(GymEnv(POINT), StepCounter()))
         with pytest.raises(ValueError, match="frame_skip=2 loses the costs"):
             cost_from_info(GymEnv(POINT, frame_skip=2))
+        with pytest.raises(TypeError, match=r"Several costs go in at once, cost=\{name: ...\}"):
+            cost_from_info(cost_from_info(GymEnv(POINT)), "violation")
         envs = gymnasium.make_vec(POINT, num_envs=2, autoreset_mode="SameStep")
         with pytest.raises(ValueError, match=r"autoreset_mode='Disabled', got .*SAME_STEP"):
             cost_from_info(GymWrapper(envs))
+
+
+class Reports(gymnasium.Env):
+    """Puts the infos of a script into ``info``, one per step, and -1 before the first."""
+
+    observation_space = gymnasium.spaces.Box(-1, 1, (3,), np.float32)
+    action_space = gymnasium.spaces.Box(-1, 1, (2,), np.float32)
+
+    def __init__(self, script):
+        self.script = script
+
+    def observe(self):
+        return self.np_random.uniform(-1, 1, 3).astype(np.float32)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.count = 0
+        return self.observe(), dict.fromkeys(["cost", "torque", "speed"], -1.0)
+
+    def step(self, action):
+        self.count += 1
+        over = self.count == len(self.script)
+        return self.observe(), 0.0, False, over, self.script[self.count - 1]
+
+
+def wrapped(*scripts) -> GymWrapper:
+    """One environment for one script, a vector environment for several."""
+    if len(scripts) == 1:
+        return GymWrapper(Reports(scripts[0]))
+    mode = gymnasium.vector.AutoresetMode.DISABLED
+    makers = [lambda script=script: Reports(script) for script in scripts]
+    return GymWrapper(gymnasium.vector.SyncVectorEnv(makers, autoreset_mode=mode))
+
+
+class TestSeveralCosts:
+    SCRIPTS = (
+        [{"torque": 0.25, "speed": 3.0}, {"torque": 0.75, "speed": 1.0}],
+        [{"torque": 0.5, "speed": 2.0}, {"torque": 0.0, "speed": 4.0}],
+    )
+
+    @pytest.mark.parametrize("num_envs", [1, 2])
+    def test_each_has_a_leaf_and_a_flag(self, num_envs):
+        env = cost_from_info(
+            wrapped(*self.SCRIPTS[:num_envs]),
+            {"torque": "torque", "speed": lambda info: info["speed"] / 2},
+            violation_above={"torque": 0.25, "speed": 0.75},
+        )
+        check_env_specs(env)
+        assert set(env.full_reward_spec.keys()) == {"reward", "torque_cost", "speed_cost"}
+        # In float64, by hand.
+        torque = np.array([[step["torque"] for step in script] for script in self.SCRIPTS])
+        speed = np.array([[step["speed"] / 2 for step in script] for script in self.SCRIPTS])
+        rollout = env.rollout(2)["next"]
+        for name, value, bound in (("torque", torque, 0.25), ("speed", speed, 0.75)):
+            value = value[:num_envs].reshape(*rollout.shape, 1)
+            assert (rollout[f"{name}_cost"].numpy() == value).all()
+            assert (rollout[f"{name}_violation"].numpy() == (value > bound)).all()
+        for name in ("torque", "speed"):
+            check_safe_env(
+                env, cost_key=f"{name}_cost", violation_key=f"{name}_violation", time_limit=2
+            )
+
+    def test_one_bound_for_all(self):
+        env = cost_from_info(
+            wrapped(self.SCRIPTS[0]), {"t": "torque", "s": "speed"}, violation_above=0.75
+        )
+        rollout = env.rollout(2)["next"]
+        assert rollout["t_violation"].flatten().tolist() == [False, False]
+        assert rollout["s_violation"].flatten().tolist() == [True, True]
+
+    def test_transforms_and_losses_take_them(self):
+        env = cost_from_info(wrapped(self.SCRIPTS[0]), {"torque": "torque", "speed": "speed"})
+        env.append_transform(RewardSum())
+        last = env.rollout(2)["next"][-1]
+        assert last["episode_torque_cost"].item() == 1.0
+        assert last["episode_speed_cost"].item() == 4.0
+
+    def test_rejects(self):
+        make = partial(cost_from_info, wrapped([]))
+        with pytest.raises(ValueError, match=r"must name at least one cost, .* got \[\]"):
+            make({})
+        with pytest.raises(ValueError, match=r"by strings, got \[1\]"):
+            make({1: "cost"})
+        with pytest.raises(TypeError, match="a key in info or a function of it, got 0.5"):
+            make({"torque": 0.5})
+        with pytest.raises(ValueError, match=r"must be for \['torque'\], got \['speed'\]"):
+            make({"torque": "torque"}, violation_above={"speed": 1.0})
+        with pytest.raises(ValueError, match=r"must be for one number, got \['speed'\]"):
+            make("torque", violation_above={"speed": 1.0})
+
+
+class TestMissingCost:
+    """What an environment did not report is missing, alone as among others."""
+
+    ALWAYS, NEVER, ONCE = [{"cost": 1.0}] * 2, [{}] * 2, [{"cost": 1.0}, {}]
+    SOURCES = ("cost", lambda info: info["cost"], lambda info: info["cost"] * 2)
+
+    @pytest.mark.parametrize("source", SOURCES)
+    @pytest.mark.parametrize("script", [NEVER, ONCE])
+    def test_alone(self, source, script):
+        with pytest.raises(KeyError, match=r"'cost': info has no 'cost'; it has \[\]"):
+            cost_from_info(wrapped(script), source).rollout(2)
+
+    @pytest.mark.parametrize("source", SOURCES)
+    @pytest.mark.parametrize("script", [NEVER, ONCE])
+    def test_among_others(self, source, script):
+        env = cost_from_info(wrapped(self.ALWAYS, script, script), source)
+        message = r"info has no 'cost' in environments \[1, 2\]; it has \['cost'\]"
+        with pytest.raises(KeyError, match=message):
+            env.rollout(2)
+
+    def test_by_all(self):
+        with pytest.raises(KeyError, match=r"info has no 'cost'; it has \[\]"):
+            cost_from_info(wrapped(self.NEVER, self.NEVER)).rollout(2)
+
+    def test_a_default(self):
+        """The same function gives each environment the costs that it has alone."""
+        scripts = (self.ALWAYS, self.NEVER, self.ONCE)
+        source = lambda info: info.get("cost", 0.25)  # noqa: E731
+        alone = [cost_from_info(wrapped(script), source).rollout(2) for script in scripts]
+        together = cost_from_info(wrapped(*scripts), source).rollout(2)
+        assert (together["next", "cost"] == torch.stack(alone)["next", "cost"]).all()
+        assert together["next", "cost"].flatten().tolist() == [1, 1, 0.25, 0.25, 1, 0.25]
+        none = cost_from_info(wrapped(self.NEVER, self.NEVER), source).rollout(2)
+        assert (none["next", "cost"] == 0.25).all()
+
+    def test_nested(self):
+        scripts = [{"costs": {"a": 1.0, "b": 2.0}}], [{"costs": {"a": 3.0}}]
+        source = lambda info: info["costs"]["a"] + info["costs"].get("b", 0.0)  # noqa: E731
+        env = cost_from_info(wrapped(*scripts), source)
+        assert env.rollout(1)["next", "cost"].flatten().tolist() == [3.0, 3.0]
+        env = cost_from_info(wrapped(*scripts), lambda info: info["costs"]["b"])
+        with pytest.raises(KeyError, match=r"info has no 'b' in environments \[1\]"):
+            env.rollout(1)
+
+
+class TestBadCost:
+    @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, None])
+    def test_not_finite(self, value):
+        good, bad = [{"cost": 1.0}] * 2, [{"cost": 1.0}, {"cost": value}]
+        with pytest.raises(ValueError, match="cost 'cost' must be finite, it is not"):
+            cost_from_info(wrapped(bad)).rollout(2)
+        with pytest.raises(ValueError, match=r"must be finite, it is not at \[\[1\]\]"):
+            cost_from_info(wrapped(good, bad)).rollout(2)
+
+    @pytest.mark.parametrize("value", ["much", {"a": 1.0}])
+    def test_no_number(self, value):
+        with pytest.raises(TypeError, match="'cost' must be numbers, got"):
+            cost_from_info(wrapped([{"cost": value}])).rollout(1)
+
+    def test_shape(self):
+        scripts = [[{"cost": np.ones(3)}]] * 2
+        with pytest.raises(ValueError, match=r"'cost' must be one .* of shape \(\), got \(3,\)"):
+            cost_from_info(wrapped(scripts[0])).rollout(1)
+        with pytest.raises(ValueError, match=r"of shape \(2,\), got \(2, 3\)"):
+            cost_from_info(wrapped(*scripts)).rollout(1)
+        env = cost_from_info(wrapped(*scripts), lambda info: info["cost"].sum())
+        with pytest.raises(ValueError, match=r"of shape \(2,\), got \(\)"):
+            env.rollout(1)
+
+    @pytest.mark.parametrize("value", [True, np.bool_(1), 1, np.int64(1), np.ones(1)])
+    def test_whatever_a_number_is_made_of(self, value):
+        script = [{"cost": value}]
+        for env in (wrapped(script), wrapped(script, script)):
+            assert (cost_from_info(env).rollout(1)["next", "cost"] == 1.0).all()
 
 
 class TestCostToReward:
@@ -164,6 +379,26 @@ class TestCostToReward:
         assert (rollout["next", "above"] == (cost > 0.01)).all()
         assert 0 < rollout["next", "above"].sum() < 200
         assert not env.reset()["above"].any()
+
+    def test_skipped_frames(self):
+        """Their costs would be lost in silence, while TorchRL adds up their rewards."""
+        for skipping in (
+            DMControlWrapper(suite.load("point", random=0), frame_skip=2),
+            SafetyGymnasiumWrapper(SixTuple(GymGoalEnv()), frame_skip=2),
+            TransformedEnv(DMControlWrapper(suite.load("point")), FrameSkipTransform(2)),
+            TransformedEnv(DMControlWrapper(suite.load("point")), SafeFrameSkip(2)),
+        ):
+            env = TransformedEnv(skipping, CostToReward(violation_key=None), auto_unwrap=False)
+            with pytest.raises(ValueError, match="frame_skip=2 loses the costs"):
+                env.rollout(2)
+
+    def test_not_finite(self):
+        env = SafetyGymnasiumWrapper(SixTuple(NaNEnv()))
+        env = TransformedEnv(env, CostToReward())
+        with pytest.raises(ValueError, match="cost 'cost' must be finite"):
+            env.rollout(2)
+        with pytest.raises(ValueError, match="violation_above must be a number, got nan"):
+            CostToReward(violation_above=float("nan"))
 
     def test_rejects(self):
         env = DMControlWrapper(suite.load("point", random=0))

@@ -2,6 +2,11 @@
 
 from __future__ import annotations
 
+import re
+import subprocess
+import sys
+from pathlib import Path
+
 import pytest
 import torch
 from torchrl.data import Binary, Composite, Unbounded
@@ -99,6 +104,42 @@ class NotFinite(Stepping):
         return td.set("observation", td["observation"].log())
 
 
+class NaNCost(Stepping):
+    def spoil(self, td):
+        return td.set("cost", td["cost"].log() * 0.0 / 0.0)
+
+
+class NegativeCost(Stepping):
+    """A cost with the sign of a reward."""
+
+    def __init__(self, *args, **kwargs):
+        super().__init__(*args, **kwargs)
+        self.full_reward_spec = Composite(
+            {key: Unbounded((*self.batch_size, 1)) for key in ("reward", "cost")},
+            shape=self.batch_size,
+        )
+
+    def spoil(self, td):
+        return td.set("cost", -td["cost"])
+
+
+class CostAlone(SafeGoalEnv):
+    def __init__(self, *args, **kwargs):
+        super().__init__(*args, **kwargs)
+        self.full_reward_spec = Composite(cost=self.full_reward_spec["cost"], shape=self.batch_size)
+
+    def _step(self, tensordict):
+        return super()._step(tensordict).exclude("reward")
+
+
+class BadStart(SafeGoalEnv):
+    """Nothing to see before the first step."""
+
+    def _reset(self, tensordict=None, **kwargs):
+        td = super()._reset(tensordict, **kwargs)
+        return td.set("observation", torch.full_like(td["observation"], torch.nan))
+
+
 class DoneAlone(Stepping):
     def spoil(self, td):
         return td.set("truncated", torch.zeros_like(td["done"]))
@@ -168,29 +209,62 @@ class HalfAState(SafeGoalEnv):
         super().load_state_dict({**state_dict, "elapsed": kept["elapsed"]})
 
 
-@pytest.mark.parametrize(
-    ("cls", "message"),
-    [
-        (NoCost, r"'cost' must be among \['reward'\]"),
-        (DoubleCost, r"'cost' must be torch.float32 \(4, 1\), its spec says torch.float64"),
-        (NoViolation, "'violation' must be among"),
-        (NumberViolation, r"'violation' must be torch.bool \(4, 1\), its spec says torch.int64"),
-        (NotFinite, "'observation' must be finite, it is not at"),
-        (DoneAlone, r"done must be terminated \| truncated, it is not in"),
-        (Terminates, "a time limit of 9 must truncate at step 9"),
-        (TerminatesToo, "a time limit truncates and does not terminate"),
-        (Remembers, "the same seed and actions give another rollout: .*reward"),
-        (Unseeded, "the same seed and actions give another rollout"),
-        (Reuses, "returned tensors are written to by later steps"),
-        (ResetsAll, "a partial reset after step 10 changes step .* of those it leaves alone"),
-        (ResetsNone, "a partial reset changes nothing where it was asked to reset"),
-        (SharedStream, "a partial reset after step 10 changes step .* of those it leaves alone"),
-        (HalfAState, r"load_state_dict\(state_dict\(\)\) is no way back"),
-    ],
-)
+BROKEN = [
+    (NoCost, r"'cost' must be among \['reward'\]"),
+    (DoubleCost, r"'cost' must be torch.float32 \(4, 1\), its spec says torch.float64"),
+    (NoViolation, "'violation' must be among"),
+    (NumberViolation, r"'violation' must be torch.bool \(4, 1\), its spec says torch.int64"),
+    (NotFinite, "'observation' must be finite, it is not at"),
+    (NaNCost, "cost"),
+    (NegativeCost, "'cost' must not be negative, it is at"),
+    (CostAlone, "there must be a reward beside 'cost'"),
+    (BadStart, "'observation' must be finite, it is not at"),
+    (DoneAlone, r"done must be terminated \| truncated, it is not in"),
+    (Terminates, "a time limit of 9 must truncate at step 9"),
+    (TerminatesToo, "a time limit truncates and does not terminate"),
+    (Remembers, "the same seed and actions give another rollout: .*reward"),
+    (Unseeded, "the same seed and actions give another rollout"),
+    (Reuses, "returned tensors are written to by later steps"),
+    (ResetsAll, "a partial reset after step 10 changes step .* of those it leaves alone"),
+    (ResetsNone, "a partial reset changes nothing where it was asked to reset"),
+    (SharedStream, "a partial reset after step 10 changes step .* of those it leaves alone"),
+    (HalfAState, r"load_state_dict\(state_dict\(\)\) is no way back"),
+]
+
+
+@pytest.mark.parametrize(("cls", "message"), BROKEN)
 def test_each_clause_can_fail(cls, message):
     with pytest.raises(AssertionError, match=message):
         check_safe_env(make(cls), time_limit=9)
+
+
+def test_each_clause_can_fail_without_assertions():
+    """Under ``python -O``, which leaves assert statements out."""
+    code = """if True:
+        from torchrl_safe.envs import check_safe_env
+        from test_checks import BROKEN, make
+        if __debug__:
+            raise SystemExit("not optimised")
+        for cls, _ in BROKEN:
+            try:
+                check_safe_env(make(cls), time_limit=9)
+                print(cls.__name__, "approved")
+            except AssertionError as error:
+                print(cls.__name__, *str(error).split())
+    """
+    path = Path(__file__).parent
+    out = subprocess.run(
+        [sys.executable, "-O", "-c", code], cwd=path, capture_output=True, text=True, check=True
+    ).stdout.splitlines()
+    assert len(out) == len(BROKEN)
+    for line, (cls, message) in zip(out, BROKEN, strict=True):
+        assert re.search(f"{cls.__name__} .*{message}", line), line
+
+
+def test_random_state_is_left_alone():
+    before = torch.get_rng_state()
+    check_safe_env(make())
+    assert torch.equal(torch.get_rng_state(), before)
 
 
 def test_torchrls_own_check_comes_first():

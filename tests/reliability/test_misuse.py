@@ -995,7 +995,7 @@ bad(
     ValueError,
     "frame_skip",
     "2",
-    "inside the Gymnasium environment",
+    "SafeFrameSkip",
 )
 
 
@@ -1005,6 +1005,40 @@ def priced() -> Any:
 
 
 bad("cost_from_info: key", priced, KeyError, "info", "'price'", "'cost'")
+bad(
+    "cost_from_info: no costs",
+    lambda: envs.cost_from_info(GymEnv("torchrl_safe/PointGoal-v0"), {}),
+    ValueError,
+    "cost",
+    "[]",
+    "at least one",
+)
+bad(
+    "cost_from_info: kind",
+    lambda: envs.cost_from_info(GymEnv("torchrl_safe/PointGoal-v0"), 3),
+    TypeError,
+    "cost",
+    "3",
+    "a key in info or a function",
+)
+bad(
+    "cost_from_info: names",
+    lambda: envs.cost_from_info(
+        GymEnv("torchrl_safe/PointGoal-v0"), {"hazard": "cost"}, violation_above={"danger": 1.0}
+    ),
+    ValueError,
+    "violation_above",
+    "['danger']",
+    "['hazard']",
+)
+bad(
+    "CostToReward: violation_above",
+    lambda: envs.CostToReward(violation_above=NAN),
+    ValueError,
+    "violation_above",
+    "nan",
+    "a number",
+)
 
 gym = cache(envs.GymGoalEnv)
 vector = cache(lambda: envs.GymGoalVectorEnv(num_envs=3, num_threads=1, autoreset_mode="Disabled"))
@@ -1051,11 +1085,11 @@ each("GymGoalVectorEnv", many, "autoreset_mode", ("Never",), "'NextStep'")
 each("GymGoalVectorEnv", many, "num_envs", (0,), "an integer >= 1")
 bad(
     "GymGoalVectorEnv.reset: seeds",
-    lambda: vector().reset(seed=[1, 2, 3]),
-    TypeError,
+    lambda: vector().reset(seed=[1, 2]),
+    ValueError,
     "seed",
-    "[1, 2, 3]",
-    "one integer or None",
+    "2 of them",
+    "one or 3",
     state=lambda: vector()._core.snapshot(),
 )
 bad(

@@ -1,21 +1,32 @@
 """Environments with a cost: robots, tasks, and their TorchRL, Gymnasium and dm_control faces.
 
-Importing this package registers the environments with Gymnasium. The dm_control face is imported
-by those who use it: ``from torchrl_safe.envs import suite``.
+Importing this package registers the environments with Gymnasium. MuJoCo is imported by the first
+environment of ours that is asked for: adapters, transforms and checks, which serve any environment,
+do without. The dm_control face is imported by those who use it: ``from torchrl_safe.envs import
+suite``.
 """
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
 
 from torchrl_safe.envs.adapters import CostToReward, cost_from_info
 from torchrl_safe.envs.checks import check_safe_env
-from torchrl_safe.envs.goal import SafeGoalEnv
-from torchrl_safe.envs.gymnasium import GymGoalEnv, GymGoalVectorEnv, register_envs
 from torchrl_safe.envs.randomization import (
     JACKAL_REAL,
     JACKAL_TRAINING,
     RANDOMIZATIONS,
     Randomization,
 )
+from torchrl_safe.envs.registration import register_envs
 from torchrl_safe.envs.robots import ROBOTS, Robot, get_robot
 from torchrl_safe.envs.tasks import GoalTask, NavigationTask
+from torchrl_safe.envs.transforms import SafeFrameSkip
+
+if TYPE_CHECKING:
+    from torchrl_safe.envs.goal import SafeGoalEnv
+    from torchrl_safe.envs.gymnasium import GymGoalEnv, GymGoalVectorEnv
 
 __all__ = [
     "JACKAL_REAL",
@@ -29,10 +40,24 @@ __all__ = [
     "NavigationTask",
     "Randomization",
     "Robot",
+    "SafeFrameSkip",
     "SafeGoalEnv",
     "check_safe_env",
     "cost_from_info",
     "get_robot",
 ]
+
+_NEED_MUJOCO = {"SafeGoalEnv": "goal", "GymGoalEnv": "gymnasium", "GymGoalVectorEnv": "gymnasium"}
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _NEED_MUJOCO:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(f"{__name__}.{_NEED_MUJOCO[name]}"), name)
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})
+
 
 register_envs()

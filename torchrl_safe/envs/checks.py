@@ -35,8 +35,8 @@ def check_safe_env(
     In this order; the first broken promise raises:
 
     1. ``check_env_specs`` of TorchRL succeeds;
-    2. the cost is a leaf of the reward spec, ``[*B, 1]``, float32; it is finite, as reward and
-       observation are;
+    2. the cost is a leaf of the reward spec beside a reward, ``[*B, 1]``, float32; it is finite, as
+       reward and observation are, and never negative;
     3. the violation is an observation, ``[*B, 1]``, bool;
     4. ``done`` is ``terminated | truncated``, and a time limit truncates without terminating;
     5. the same seed and actions give the same rollout, whatever happened before;
@@ -47,7 +47,8 @@ def check_safe_env(
     9. ``load_state_dict(state_dict())`` of the innermost environment is a way back, if its state
        has entries at all. (That of an environment which saves nothing has none.)
 
-    The environment is stepped and reset; it is left after a reset under ``seed``.
+    The environment is stepped and reset; it is left after a reset under ``seed``. PyTorch's global
+    random state on the CPU is put back. The checks run under ``python -O``, too.
 
     Args:
         env (EnvBase): the environment, with or without transforms. Any batch size.
@@ -75,76 +76,104 @@ def check_safe_env(
     for name, value in (("num_steps", num_steps), ("time_limit", time_limit)):
         if value is not None and value < 1:
             raise ValueError(f"{name} must be positive, got {value}.")
-    with _quiet():
+    with _quiet(), torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
         check_env_specs(env, seed=seed)
+        _check_promises(env, twins, time_limit, num_steps, seed, cost_key, violation_key)
+
+
+def _check_promises(
+    env: EnvBase,
+    twins: Iterable[EnvBase],
+    time_limit: int | None,
+    num_steps: int,
+    seed: int,
+    cost_key: NestedKey,
+    violation_key: NestedKey | None,
+) -> None:
     shape = torch.Size((*env.batch_size, 1))
     _check_leaf(env.full_reward_spec, cost_key, shape, torch.float32)
+    _promise(len(env.reward_keys) > 1, f"there must be a reward beside {cost_key!r}.")
     if violation_key is not None:
         _check_leaf(env.full_observation_spec, violation_key, shape, torch.bool)
 
     actions = [env.full_action_spec.rand() for _ in range(max(num_steps, time_limit or 0))]
     kept: list[TensorDictBase] = []
     rollout = _rollout(env, actions, seed, kept)
-    _check_finite(env, rollout, cost_key)
+    _check_values(env, rollout, cost_key)
     _check_done(rollout)
     if time_limit is not None:
         _check_time_limit(rollout, time_limit)
     for step, copy in zip(kept, rollout, strict=True):
         difference = _difference(step, copy)
-        assert not difference, f"returned tensors are written to by later steps: {difference}."
+        _promise(not difference, f"returned tensors are written to by later steps: {difference}.")
 
     difference = _difference(_rollout(env, actions, seed), rollout)
-    assert not difference, f"the same seed and actions give another rollout: {difference}."
+    _promise(not difference, f"the same seed and actions give another rollout: {difference}.")
     if env.batch_size.numel() > 1:
         _check_partial_reset(env, actions, seed, rollout)
     for number, twin in enumerate(twins):
         difference = _difference(_rollout(twin, actions, seed), rollout)
-        assert not difference, f"twin {number} gives another rollout: {difference}."
+        _promise(not difference, f"twin {number} gives another rollout: {difference}.")
     _check_state(env, actions, seed)
     env.set_seed(seed)
     env.reset()
 
 
+def _promise(kept: bool | torch.Tensor, message: str) -> None:
+    """An assertion that ``python -O`` keeps."""
+    if not kept:
+        raise AssertionError(message)
+
+
 def _check_leaf(spec: Composite, key: NestedKey, shape: torch.Size, dtype: torch.dtype) -> None:
     leaves = list(spec.keys(True, True))
-    assert key in leaves, f"{key!r} must be among {leaves}."
+    _promise(key in leaves, f"{key!r} must be among {leaves}.")
     found = spec[key].shape, spec[key].dtype
-    assert found == (shape, dtype), (
-        f"{key!r} must be {dtype} {tuple(shape)}, its spec says {found[1]} {tuple(found[0])}."
+    _promise(
+        found == (shape, dtype),
+        f"{key!r} must be {dtype} {tuple(shape)}, its spec says {found[1]} {tuple(found[0])}.",
     )
 
 
-def _check_finite(env: EnvBase, rollout: TensorDictBase, cost_key: NestedKey) -> None:
-    observations = env.full_observation_spec.keys(True, True)
-    for key in {*env.reward_keys, cost_key, *observations}:
-        value = rollout["next"].get(key)
-        if value.is_floating_point():
-            wrong = ~value.isfinite()
-            assert not wrong.any(), f"{key!r} must be finite, it is not at {_where(wrong)}."
+def _check_values(env: EnvBase, rollout: TensorDictBase, cost_key: NestedKey) -> None:
+    observations = list(env.full_observation_spec.keys(True, True))
+    for steps, keys in ((rollout, observations), (rollout["next"], observations + env.reward_keys)):
+        for key in keys:
+            value = steps.get(key)
+            if value.is_floating_point():
+                wrong = ~value.isfinite()
+                _promise(not wrong.any(), f"{key!r} must be finite, it is not at {_where(wrong)}.")
+    negative = rollout["next"].get(cost_key) < 0
+    _promise(not negative.any(), f"{cost_key!r} must not be negative, it is at {_where(negative)}.")
 
 
 def _check_done(rollout: TensorDictBase) -> None:
     present = [key for key in _DONE_KEYS if key in rollout["next"].keys()]
-    assert len(present) == 3, f"a step must return {_DONE_KEYS}, it returns {present}."
+    _promise(len(present) == 3, f"a step must return {_DONE_KEYS}, it returns {present}.")
     done, terminated, truncated = (rollout["next", key] for key in _DONE_KEYS)
     wrong = done != (terminated | truncated)
-    assert not wrong.any(), f"done must be terminated | truncated, it is not in {_where(wrong)}."
+    _promise(not wrong.any(), f"done must be terminated | truncated, it is not in {_where(wrong)}.")
 
 
 def _check_time_limit(rollout: TensorDictBase, time_limit: int) -> None:
     done = rollout["next", "done"].reshape(len(rollout), -1)
     last = rollout[time_limit - 1]["next"]
     whole = ~done[: time_limit - 1].any(0)
-    assert last["truncated"].flatten()[whole].all(), (
+    _promise(
+        last["truncated"].flatten()[whole].all(),
         f"a time limit of {time_limit} must truncate at step {time_limit}: it did not, "
-        "or an earlier step did."
+        "or an earlier step did.",
     )
     early = rollout["next", "truncated"].reshape(len(rollout), -1)[: time_limit - 1]
-    assert not early.any(), f"truncated at steps {_where(early)}, before the limit of {time_limit}."
+    _promise(
+        not early.any(), f"truncated at steps {_where(early)}, before the limit of {time_limit}."
+    )
     terminated = last["terminated"].flatten()
-    assert not terminated[whole].all() or not whole.any(), (
+    _promise(
+        not terminated[whole].all() or not whole.any(),
         f"a time limit truncates and does not terminate: all that reached step {time_limit} are "
-        "terminated."
+        "terminated.",
     )
 
 
@@ -164,13 +193,14 @@ def _check_partial_reset(
     )
     # Those whose episode was over are at a start already.
     over = half == 0 or rollout["next", "done"][half - 1][rows].all()
-    assert changed or over, "a partial reset changes nothing where it was asked to reset."
+    _promise(changed or over, "a partial reset changes nothing where it was asked to reset.")
     for step, action in enumerate(actions[half:], half):
         stepped, td = env.step_and_maybe_reset(td.update(action.clone()))
         difference = _difference(stepped["next"][~rows], rollout[step]["next"][~rows])
-        assert not difference, (
+        _promise(
+            not difference,
             f"a partial reset after step {half} changes step {step} of those it leaves alone: "
-            f"{difference}."
+            f"{difference}.",
         )
 
 
@@ -184,7 +214,7 @@ def _check_state(env: EnvBase, actions: list[TensorDictBase], seed: int) -> None
     expected = _continue(env, td.clone(), actions[half:])
     inner.load_state_dict(state)
     difference = _difference(_continue(env, td.clone(), actions[half:]), expected)
-    assert not difference, f"load_state_dict(state_dict()) is no way back: {difference}."
+    _promise(not difference, f"load_state_dict(state_dict()) is no way back: {difference}.")
 
 
 def _has_leaves(state: Mapping[str, Any]) -> bool:

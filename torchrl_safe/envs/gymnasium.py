@@ -1,48 +1,45 @@
-"""The Gymnasium face of the environments: ``gymnasium.make`` and ``gymnasium.make_vec``.
-
-Importing ``torchrl_safe.envs`` registers ``torchrl_safe/PointGoal-v0`` and its siblings, one per
-entry of ``ROBOTS``.
-"""
+"""The Gymnasium face of the environments: what ``gymnasium.make`` and ``make_vec`` build."""
 
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import gymnasium
 import numpy as np
+from gymnasium.envs.registration import EnvSpec
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from torchrl_safe.envs._core import Core, Frame, Mask, make_core
-from torchrl_safe.envs._random import check_seed
+from torchrl_safe.envs._random import RandomStreams, check_seed
 from torchrl_safe.envs.randomization import Randomization
-from torchrl_safe.envs.robots import ROBOTS, Array, Robot
+from torchrl_safe.envs.robots import Array, Robot
 from torchrl_safe.envs.tasks import Task
 
-__all__ = ["GymGoalEnv", "GymGoalVectorEnv", "register_envs"]
+__all__ = ["GymGoalEnv", "GymGoalVectorEnv"]
 
 _NO_RENDER_MODE = "render() draws nothing: make the environment with a render_mode."
-_INFO = ("cost", "violation", "violations", "goal_met")
-
-# The core truncates a simulation long before: MuJoCo takes a position, velocity or acceleration
-# beyond 1e10 for diverged, and no reading is scaled up by more than 100. The bound is there because
-# Gymnasium's checker warns of an unbounded space.
-_BOUND = np.float32(1e12)
+_NO_STEP: dict[str, Any] = {"cost": 0.0, "violation": False, "violations": 0, "goal_met": False}
 
 
 class GymGoalEnv(gymnasium.Env[NDArray[Any], NDArray[Any]]):
     """One robot and its task as a :class:`gymnasium.Env`, with the cost in ``info``.
 
     Steps are those of :class:`~torchrl_safe.envs.SafeGoalEnv` with one environment and the same
-    seed. A time limit is ``truncated``, a collision ``terminated``. ``info`` holds, after a step as
-    after a reset, NumPy scalars:
+    seed. A time limit is ``truncated``, a collision ``terminated``. ``info`` holds what the step
+    brought, as plain Python numbers; a reset is no step and brings 0 and ``False``:
 
-    * ``cost`` (float64);
+    * ``cost`` (float);
     * ``violation`` (bool), inside a hazard or in contact;
-    * ``violations`` (int64), how many violating steps this one counts for;
+    * ``violations`` (int), how many violating steps this one counts for;
     * ``goal_met`` (bool), goal reached in this step.
+
+    The observation space has no bounds: no reading of a moving robot has any. Copies and pickles go
+    on where the environment stands, without its window or GL context.
 
     Args:
         robot (str or Robot): the robot, or its name in ``ROBOTS``. Default: ``"point"``.
@@ -50,8 +47,9 @@ class GymGoalEnv(gymnasium.Env[NDArray[Any], NDArray[Any]]):
     Keyword Args:
         task (Task, optional): the task with its options. Default: that of the robot.
         randomization (Randomization, optional): how the robots differ from their model.
-        episode_length (int): steps until truncation. Gymnasium's own ``max_episode_steps`` works
-            too, but the task does not know of it. Default: 1000.
+        episode_length (int): steps until truncation, which is ``spec.max_episode_steps``. The
+            argument ``max_episode_steps`` of ``gymnasium.make`` cuts an episode short from outside,
+            and the task does not know of it. Default: 1000.
         render_mode (str, optional): ``"rgb_array"``, ``"human"`` (a window) or ``None``.
         width (int): pixels of a picture. Default: 480.
         height (int): pixels of a picture. Default: 360.
@@ -71,6 +69,7 @@ class GymGoalEnv(gymnasium.Env[NDArray[Any], NDArray[Any]]):
     """
 
     metadata: dict[str, Any] = {"render_modes": ["rgb_array", "human"]}  # noqa: RUF012
+    _spec: EnvSpec | None = None
 
     def __init__(
         self,
@@ -98,6 +97,16 @@ class GymGoalEnv(gymnasium.Env[NDArray[Any], NDArray[Any]]):
         self._size = (width, height)
         self._renderer: Any = None
         self._drawn_at = 0.0
+        self._closed = False
+
+    @property
+    def spec(self) -> EnvSpec | None:  # type: ignore[override]
+        """What ``gymnasium.make`` was told, with the steps of an episode."""
+        return self._spec
+
+    @spec.setter
+    def spec(self, spec: EnvSpec | None) -> None:
+        self._spec = _with_length(spec, self._core)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -110,7 +119,9 @@ class GymGoalEnv(gymnasium.Env[NDArray[Any], NDArray[Any]]):
 
         Raises:
             ValueError: if the seed is negative or there are options.
+            RuntimeError: if the environment is closed.
         """
+        _require(not self._closed)
         _no_options(options)
         check_seed("seed", seed)
         super().reset(seed=seed)
@@ -119,7 +130,7 @@ class GymGoalEnv(gymnasium.Env[NDArray[Any], NDArray[Any]]):
         frame = self._core.reset()
         if self.render_mode == "human":
             self.render()
-        return frame.observation[0].copy(), _scalars(frame)
+        return frame.observation[0].copy(), dict(_NO_STEP)
 
     def step(
         self, action: NDArray[np.floating]
@@ -134,8 +145,9 @@ class GymGoalEnv(gymnasium.Env[NDArray[Any], NDArray[Any]]):
 
         Raises:
             ValueError: if the action has another shape or is not finite; nothing has moved then.
-            RuntimeError: before the first reset.
+            RuntimeError: before the first reset, or if the environment is closed.
         """
+        _require(not self._closed)
         action = _checked_action(action, self.action_space.shape)
         frame = self._core.step(action[None])
         if self.render_mode == "human":
@@ -145,15 +157,16 @@ class GymGoalEnv(gymnasium.Env[NDArray[Any], NDArray[Any]]):
             float(frame.reward[0]),
             bool(frame.terminated[0]),
             bool(frame.truncated[0]),
-            _scalars(frame),
+            {name: getattr(frame, name)[0].item() for name in _NO_STEP},
         )
 
     def render(self) -> NDArray[np.uint8] | None:
         """A picture [H, W, 3], or ``None`` after showing it in a window in real time.
 
         Raises:
-            RuntimeError: if there is no display to open a window on.
+            RuntimeError: if there is no display to open a window on, or the environment is closed.
         """
+        _require(not self._closed)
         if self.render_mode is None:
             gymnasium.logger.warn(_NO_RENDER_MODE)
             return None
@@ -187,20 +200,26 @@ class GymGoalEnv(gymnasium.Env[NDArray[Any], NDArray[Any]]):
         self._core.restore(snapshot)
 
     def close(self) -> None:
-        """Closes the window or the GL context."""
+        """Closes the window or the GL context; the environment does not step or draw any more."""
+        self._closed = True
         if self._renderer is not None:
             self._renderer.close()
             self._renderer = None
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "_renderer": None}
 
 
 class GymGoalVectorEnv(gymnasium.vector.VectorEnv[NDArray[Any], NDArray[Any], NDArray[Any]]):
     """N environments on a thread pool as a :class:`gymnasium.vector.VectorEnv`.
 
     ``infos`` holds the arrays ``cost``, ``violation``, ``violations`` and ``goal_met``, [N] each,
-    and Gymnasium's masks ``_cost``, ... of what is valid, here all of it. The autoreset mode says
-    what happens to environments whose episode is over:
+    and Gymnasium's masks ``_cost``, ... of the environments that stepped or were reset. A reset is
+    no step and brings 0 and ``False``. The autoreset mode says what happens to environments whose
+    episode is over:
 
-    * ``NEXT_STEP``: their next step ignores the action, resets them and returns reward 0;
+    * ``NEXT_STEP``: their next step ignores the action, resets them and returns reward 0 and
+      cost 0;
     * ``SAME_STEP``: they are reset at once. The observation is the new episode's; reward and
       ``infos["cost"]`` are the ended one's last, as are ``infos["final_obs"]`` and
       ``infos["final_info"]``;
@@ -215,7 +234,9 @@ class GymGoalVectorEnv(gymnasium.vector.VectorEnv[NDArray[Any], NDArray[Any], ND
         num_threads (int): simulator threads. Default: 2.
         task (Task, optional): the task with its options. Default: that of the robot.
         randomization (Randomization, optional): how the robots differ from their model.
-        episode_length (int): steps until truncation. Default: 1000.
+        episode_length (int, optional): steps until truncation. Default: 1000.
+        max_episode_steps (int, optional): the same by the name that Gymnasium has for it and
+            ``make_vec`` hands on.
         stagger (bool): start the episodes of a full reset at different phases. Default: ``False``.
         autoreset_mode (AutoresetMode or str): Default: ``NEXT_STEP``, as in Gymnasium.
         render_mode (str, optional): ``"rgb_array"`` or ``None``.
@@ -223,8 +244,8 @@ class GymGoalVectorEnv(gymnasium.vector.VectorEnv[NDArray[Any], NDArray[Any], ND
         height (int): pixels of a picture. Default: 360.
 
     Raises:
-        ValueError: if the robot or a mode is unknown, an option is out of range, or the objects do
-            not fit.
+        ValueError: if the robot or a mode is unknown, an option is out of range, the objects do
+            not fit, or ``episode_length`` and ``max_episode_steps`` differ.
 
     Examples:
         >>> import gymnasium
@@ -240,6 +261,7 @@ class GymGoalVectorEnv(gymnasium.vector.VectorEnv[NDArray[Any], NDArray[Any], ND
         "render_modes": ["rgb_array"],
         "autoreset_mode": AutoresetMode.NEXT_STEP,
     }
+    _spec: EnvSpec | None = None
 
     def __init__(
         self,
@@ -249,7 +271,8 @@ class GymGoalVectorEnv(gymnasium.vector.VectorEnv[NDArray[Any], NDArray[Any], ND
         num_threads: int = 2,
         task: Task | None = None,
         randomization: Randomization | None = None,
-        episode_length: int = 1000,
+        episode_length: int | None = None,
+        max_episode_steps: int | None = None,
         stagger: bool = False,
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
         render_mode: str | None = None,
@@ -259,6 +282,15 @@ class GymGoalVectorEnv(gymnasium.vector.VectorEnv[NDArray[Any], NDArray[Any], ND
         modes = [mode.value for mode in AutoresetMode]
         if autoreset_mode not in (*AutoresetMode, *modes):
             raise ValueError(f"autoreset_mode must be one of {modes}, got {autoreset_mode!r}.")
+        if None not in (episode_length, max_episode_steps) and episode_length != max_episode_steps:
+            raise ValueError(
+                "episode_length and max_episode_steps are two names of one thing, got "
+                f"{episode_length} and {max_episode_steps}."
+            )
+        if episode_length is None:
+            episode_length = 1000 if max_episode_steps is None else max_episode_steps
+        if episode_length < 1 and max_episode_steps is not None:
+            raise ValueError(f"max_episode_steps must be at least 1, got {max_episode_steps}.")
         self.autoreset_mode = AutoresetMode(autoreset_mode)
         self._core = make_core(
             robot,
@@ -281,39 +313,69 @@ class GymGoalVectorEnv(gymnasium.vector.VectorEnv[NDArray[Any], NDArray[Any], ND
         self._size = (width, height)
         self._renderer: Any = None
 
+    @property
+    def spec(self) -> EnvSpec | None:  # type: ignore[override]
+        """What ``gymnasium.make_vec`` was told, with the steps of an episode."""
+        return self._spec
+
+    @spec.setter
+    def spec(self, spec: EnvSpec | None) -> None:
+        self._spec = _with_length(spec, self._core)
+
     def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+        self,
+        *,
+        seed: int | Sequence[int | None] | None = None,
+        options: dict[str, Any] | None = None,
     ) -> tuple[NDArray[np.float32], dict[str, Any]]:
         """Starts new episodes.
 
         Args:
-            seed (int, optional): one for all; each environment has its own stream under it.
-            options (dict, optional): ``{"reset_mask": mask}``, [N] bool, resets those alone.
+            seed (int or sequence, optional): one for all, under which each environment has its own
+                stream; or one for each, N of them, which make its episodes those of a
+                :class:`GymGoalEnv` with that seed. Where there is none, the sequence of episodes
+                goes on.
+            options (dict, optional): ``{"reset_mask": mask}``, [N] bool, seeds and resets those
+                alone.
 
         Raises:
-            TypeError: if the seed is a sequence.
-            ValueError: if the seed is negative, the mask is not a bool array [N], or there are
-                other options.
+            ValueError: if a seed is negative or no integer, there is another number of them, the
+                mask is not a bool array [N], or there are other options.
+            RuntimeError: if the environment is closed.
         """
+        _require(not self.closed)
         options = dict(options or {})
-        mask = options.pop("reset_mask", None)
-        _no_options(options)
-        if mask is not None:
-            mask = np.asarray(mask)
+        mask = np.ones(self.num_envs, bool)
+        partial = "reset_mask" in options
+        if partial:
+            mask = np.asarray(options.pop("reset_mask"))
             if mask.shape != (self.num_envs,) or mask.dtype != np.bool_:
                 raise ValueError(
                     f"reset_mask must be a bool array of shape {(self.num_envs,)}, "
                     f"got {mask.dtype} {mask.shape}."
                 )
-        if seed is not None and not isinstance(seed, (int, np.integer)):
-            raise TypeError(f"seed must be one integer or None, got {seed!r}.")
-        check_seed("seed", seed)
-        super().reset(seed=seed)
-        if seed is not None:
-            self._core.seed(seed)
-        frame = self._core.reset(mask)
-        self._over = self._over & ~mask if mask is not None else np.zeros(self.num_envs, bool)
-        return frame.observation.copy(), _arrays(frame)
+        _no_options(options)
+        self._seed(seed, mask)
+        frame = self._core.reset(mask if partial else None)
+        self._over = self._over & ~mask
+        return frame.observation.copy(), _arrays(frame, np.zeros_like(mask), mask)
+
+    def _seed(self, seed: int | Sequence[int | None] | None, mask: Mask) -> None:
+        """Restarts the random streams of the environments in ``mask`` that have a seed."""
+        if isinstance(seed, (list, tuple, np.ndarray)):
+            if len(seed) != self.num_envs:
+                raise ValueError(f"seed must be one or {self.num_envs}, got {len(seed)} of them.")
+            for row, own in enumerate(seed):
+                check_seed(f"seed[{row}]", own)
+            mask = mask & np.array([own is not None for own in seed])
+            fresh = np.concatenate([RandomStreams(own, 1).state for own in seed])
+        else:
+            check_seed("seed", seed)
+            if seed is None:
+                return
+            super().reset(seed=int(seed))
+            fresh = RandomStreams(seed, self.num_envs).state
+        self._core.rewind(mask, fresh)
 
     def step(
         self, actions: NDArray[np.floating]
@@ -328,8 +390,10 @@ class GymGoalVectorEnv(gymnasium.vector.VectorEnv[NDArray[Any], NDArray[Any], ND
 
         Raises:
             ValueError: if the actions have another shape or are not finite; nothing has moved then.
-            RuntimeError: before the first reset, or if an episode is over and autoreset is off.
+            RuntimeError: before the first reset, if an episode is over and autoreset is off, or if
+                the environment is closed.
         """
+        _require(not self.closed)
         actions = _checked_action(actions, self.action_space.shape)
         over = self._over
         if over.any() and self.autoreset_mode is AutoresetMode.DISABLED:
@@ -342,7 +406,8 @@ class GymGoalVectorEnv(gymnasium.vector.VectorEnv[NDArray[Any], NDArray[Any], ND
             self._core.rewind(over, random_state)
             frame = self._core.reset(over)
         done = frame.terminated | frame.truncated
-        infos = _arrays(frame)
+        everywhere = np.ones(self.num_envs, bool)
+        infos = _arrays(frame, ~over, everywhere)
         observations = frame.observation
         if self.autoreset_mode is AutoresetMode.SAME_STEP:
             if done.any():
@@ -359,7 +424,12 @@ class GymGoalVectorEnv(gymnasium.vector.VectorEnv[NDArray[Any], NDArray[Any], ND
         )
 
     def render(self) -> tuple[NDArray[np.uint8], ...] | None:
-        """A picture [H, W, 3] of each environment."""
+        """A picture [H, W, 3] of each environment.
+
+        Raises:
+            RuntimeError: if the environment is closed.
+        """
+        _require(not self.closed)
         if self.render_mode is None:
             gymnasium.logger.warn(_NO_RENDER_MODE)
             return None
@@ -370,30 +440,29 @@ class GymGoalVectorEnv(gymnasium.vector.VectorEnv[NDArray[Any], NDArray[Any], ND
         return tuple(self._renderer.draw(index) for index in range(self.num_envs))
 
     def close_extras(self, **kwargs: Any) -> None:
-        """Frees the GL context."""
+        """Frees the GL context; the environment does not step or draw any more."""
         if self._renderer is not None:
             self._renderer.close()
             self._renderer = None
 
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "_renderer": None}
 
-def register_envs() -> None:
-    """Registers an id for each robot with Gymnasium: ``torchrl_safe/<Robot>Goal-v0``.
 
-    The robot's name in camel case: ``torchrl_safe/DoggoTorquesGoal-v0`` is ``"doggo_torques"``.
-    """
-    for name in ROBOTS:
-        gymnasium.register(
-            f"torchrl_safe/{name.title().replace('_', '')}Goal-v0",
-            entry_point="torchrl_safe.envs.gymnasium:GymGoalEnv",
-            vector_entry_point="torchrl_safe.envs.gymnasium:GymGoalVectorEnv",
-            kwargs={"robot": name},
-        )
+def _with_length(spec: EnvSpec | None, core: Core) -> EnvSpec | None:
+    """Gymnasium leaves the length out, as it knows only of limits that it sets itself."""
+    return None if spec is None else replace(spec, max_episode_steps=core.episode_length)
+
+
+def _require(is_open: bool) -> None:
+    if not is_open:
+        raise RuntimeError("the environment is closed: make another one.")
 
 
 def _spaces(core: Core) -> tuple[gymnasium.spaces.Box, gymnasium.spaces.Box]:
     """Of observations [D] and actions [A], float32."""
     return (
-        gymnasium.spaces.Box(-_BOUND, _BOUND, (core.observation_size,), np.float32),
+        gymnasium.spaces.Box(-np.inf, np.inf, (core.observation_size,), np.float32),
         gymnasium.spaces.Box(-1.0, 1.0, (core.action_dim,), np.float32),
     )
 
@@ -422,13 +491,14 @@ def _no_options(options: dict[str, Any] | None) -> None:
         raise ValueError(f"unknown reset options: {sorted(options)}.")
 
 
-def _scalars(frame: Frame) -> dict[str, Any]:
-    return {name: getattr(frame, name)[0] for name in _INFO}
-
-
-def _arrays(frame: Frame) -> dict[str, Any]:
-    values = {name: getattr(frame, name).copy() for name in _INFO}
-    return values | {f"_{name}": np.ones(len(value), bool) for name, value in values.items()}
+def _arrays(frame: Frame, stepped: Mask, shown: Mask) -> dict[str, Any]:
+    """What the steps of the environments ``stepped`` brought, and Gymnasium's masks, [N] each."""
+    infos = {}
+    for name in _NO_STEP:
+        value = getattr(frame, name).copy()
+        value[~stepped] = 0
+        infos |= {name: value, f"_{name}": shown.copy()}
+    return infos
 
 
 def _final(frame: Frame, done: Mask) -> dict[str, Any]:
@@ -436,14 +506,9 @@ def _final(frame: Frame, done: Mask) -> dict[str, Any]:
     last = np.full(len(done), None, object)
     for row in np.flatnonzero(done):
         last[row] = frame.observation[row].copy()
-    info: dict[str, Any] = {}
-    for name in _INFO:
-        value = getattr(frame, name)
-        info[name] = np.where(done, value, np.zeros_like(value))
-        info[f"_{name}"] = done.copy()
     return {
         "final_obs": last,
         "_final_obs": done.copy(),
-        "final_info": info,
+        "final_info": _arrays(frame, done, done),
         "_final_info": done.copy(),
     }

@@ -1,0 +1,25 @@
+"""The environments' ids in Gymnasium's registry, written without loading the simulator."""
+
+from __future__ import annotations
+
+import gymnasium
+
+from torchrl_safe.envs.robots import ROBOTS
+
+__all__ = ["register_envs"]
+
+
+def register_envs() -> None:
+    """Registers an id for each robot with Gymnasium: ``torchrl_safe/<Robot>Goal-v0``.
+
+    The robot's name in camel case: ``torchrl_safe/DoggoTorquesGoal-v0`` is ``"doggo_torques"``. The
+    registry has no ``max_episode_steps``, as Gymnasium would cut a longer ``episode_length`` short
+    by it; the ``spec`` of an environment has.
+    """
+    for name in ROBOTS:
+        gymnasium.register(
+            f"torchrl_safe/{name.title().replace('_', '')}Goal-v0",
+            entry_point="torchrl_safe.envs.gymnasium:GymGoalEnv",
+            vector_entry_point="torchrl_safe.envs.gymnasium:GymGoalVectorEnv",
+            kwargs={"robot": name},
+        )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import itertools
 import os
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -160,7 +161,7 @@ def _plain_config(path: Path, options: Any) -> DictConfig:
         elif isinstance(value, list):
             pending += value
         elif isinstance(value, str) and "${" in value:
-            raise CheckpointError(f"{printable(path)} refers to something else: {ascii(value)}.")
+            raise CheckpointError(f"{printable(path)} refers to something else: {value!a}.")
     try:
         return OmegaConf.create(options)
     except Exception as error:  # of kinds that are OmegaConf's own
@@ -174,7 +175,8 @@ def _check_cost(cfg: DictConfig) -> None:
     outputs = ENDS * (OmegaConf.select(cfg, "policy.num_components") or 1)
     for name in ("policy.num_cells", "critic.num_cells", "network.num_cells"):
         cells = OmegaConf.select(cfg, name) or []
-        if sum(a * b for a, b in zip([ENDS, *cells], [*cells, outputs])) > MOST_WEIGHTS:
+        sizes = [ENDS, *cells, outputs]
+        if sum(a * b for a, b in itertools.pairwise(sizes)) > MOST_WEIGHTS:
             raise ValueError(f"{name} must be of at most {MOST_WEIGHTS:,} weights.")
 
 

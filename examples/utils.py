@@ -328,9 +328,7 @@ class Run:
 
     def _check_width(self) -> None:
         """The replay buffer has a column for every environment of a batch."""
-        saved, new = (
-            envs_per_batch(cfg) for cfg in (read_config(self.path / CONFIG), self.cfg)
-        )
+        saved, new = (envs_per_batch(cfg) for cfg in (read_config(self.path / CONFIG), self.cfg))
         if saved != new:
             raise ValueError(
                 f"run_dir={self.cfg.run_dir} has replayed batches of {saved} environments and "

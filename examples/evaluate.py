@@ -14,16 +14,19 @@ from __future__ import annotations
 import argparse
 import json
 from pathlib import Path
+from typing import NamedTuple
 
 import torch
-from checkpoints import load_component
+from checkpoints import load_components
 from critics import make_losses
 from omegaconf import DictConfig
+from saved import from_newest
 from tensordict import TensorDictBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
-from utils import load_policy, load_run, make_env
+from utils import make_env, saved_policy
 
 from torchrl_safe import CVaRCostLoss, GMMTanhPolicy
+from torchrl_safe._files import expand, make_folder, printable, write_atomically
 from torchrl_safe.envs import RANDOMIZATIONS, SafeGoalEnv
 from torchrl_safe.record import (
     calibrate,
@@ -41,15 +44,28 @@ NUM_FILMED = 9
 SEED = 2_000_003  # of layouts that neither training nor its evaluations see
 
 
-def load_cost_loss(
-    cfg: DictConfig, checkpoint: Path, env: SafeGoalEnv, policy: GMMTanhPolicy
-) -> CVaRCostLoss | None:
-    """The safety critics of a run of safetac_point.py; None for the other methods' runs."""
+class Subject(NamedTuple):
+    """What is evaluated, all of one checkpoint.
+
+    Attributes:
+        cfg: the configuration.
+        policy: the policy.
+        cost_loss: the safety critics of a run of safetac_point.py; None for the other methods'.
+    """
+
+    cfg: DictConfig
+    policy: GMMTanhPolicy
+    cost_loss: CVaRCostLoss | None
+
+
+def load(cfg: DictConfig, checkpoint: Path) -> Subject:
+    """Read a checkpoint."""
+    policy = saved_policy(cfg, checkpoint)
     if "variance_reward" not in cfg.loss:
-        return None
-    _, cost_loss = make_losses(cfg, env, policy)
-    load_component(checkpoint, "cost_loss", cost_loss)
-    return cost_loss
+        return Subject(cfg, policy, None)
+    _, cost_loss = make_losses(cfg, make_env(cfg, num_envs=1, seed=0), policy)
+    load_components(checkpoint, cost_loss=cost_loss)
+    return Subject(cfg, policy, cost_loss)
 
 
 def shares(episodes: TensorDictBase, prefix: str) -> dict[str, float]:
@@ -89,14 +105,14 @@ def main(
     run_dir: Path, episodes: int, seed: int, film: bool, randomization: str | None = None
 ) -> dict[str, float]:
     """Evaluate, draw, and return the numbers."""
-    cfg, checkpoint = load_run(run_dir)
-    policy = load_policy(run_dir)
+    run_dir = expand(run_dir)
+    # Before the episodes: a run that still trains replaces its checkpoint meanwhile.
+    cfg, policy, cost_loss = from_newest(run_dir, load)
     num_steps = cfg.eval.num_steps
     out = run_dir / (f"evaluation_{randomization}" if randomization else "evaluation")
+    make_folder(out)
     options = {"episode_length": num_steps, "randomization": RANDOMIZATIONS.get(randomization)}
     env = make_env(cfg, episodes, seed, **options)
-    # Before the episodes: a run that still trains replaces its checkpoint meanwhile.
-    cost_loss = load_cost_loss(cfg, checkpoint, env, policy)
     metrics: dict[str, float] = {}
     for prefix, kind in (("det/", "DETERMINISTIC"), ("sampled/", "RANDOM")):
         played = evaluate(
@@ -121,7 +137,7 @@ def main(
                 error = bins[f"predicted_{name}"] - bins[f"realised_{name}"]
                 metrics[f"calibration/{name}_bias"] = error.mean().item()
                 metrics[f"calibration/{name}_error"] = error.abs().mean().item()
-    (out / "results.json").write_text(json.dumps(metrics, indent=2) + "\n")
+    write_atomically(out / "results.json", json.dumps(metrics, indent=2) + "\n")
     print(format_table(metrics))
     if film:
         small = make_env(cfg, filmed, seed, **options)
@@ -141,7 +157,7 @@ def main(
             print(f"no video: {error}")
         small.close()
     env.close()
-    print(f"written to {out}")
+    print(f"written to {printable(out)}")
     return metrics
 
 

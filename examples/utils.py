@@ -22,15 +22,17 @@ from types import FrameType
 from typing import Any
 
 import torch
-from checkpoints import adapter_of, latest, load_component, remove_leftovers, write_atomically
+from checkpoints import Rotation, SealedCheckpoint, latest, load_components, remove_leftovers
 from collectors import WorkerDied, envs_per_batch, make_collector
 from config import check_config
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
+from saved import CONFIG, Configuration, from_newest, read_config, write_config
+from saved import load_run as load_run
 from tensordict import TensorDictBase
 from torch import nn
 from torchrl._utils import logger as torchrl_logger
 from torchrl._utils import timeit
-from torchrl.checkpoint import Checkpoint, CheckpointRotation, GlobalRNGState
+from torchrl.checkpoint import CheckpointError, GlobalRNGState
 from torchrl.collectors import BaseCollector
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType
@@ -39,6 +41,7 @@ from torchrl.record.loggers import get_logger
 from tqdm import tqdm
 
 from torchrl_safe import GMMTanhPolicy
+from torchrl_safe._files import printable, regular_files, write_atomically
 from torchrl_safe.envs import RANDOMIZATIONS, SafeGoalEnv
 from torchrl_safe.record import (
     batch_metrics,
@@ -252,11 +255,13 @@ class Run:
         self.path = Path(cfg.run_dir)
         self.counters = Counters(frames=0, total_cvs=0, instabilities=0, seconds=0.0)
         self._saved: int | None = None  # frames of the newest checkpoint
-        self.checkpoint = Checkpoint()
-        self._register(counters=self.counters, random=GlobalRNGState(), **components)
-        self.rotation = CheckpointRotation(
-            self.path / "checkpoints", keep_last=cfg.checkpoint.keep_last
+        self.checkpoint = SealedCheckpoint(
+            config=Configuration(cfg),
+            counters=self.counters,
+            random=GlobalRNGState(),
+            **components,
         )
+        self.rotation = Rotation(self.path, cfg.checkpoint.keep_last)
         exists = (self.path / "config.yaml").exists()
         if cfg.resume and not exists:
             raise FileNotFoundError(f"run_dir={cfg.run_dir} holds no run to resume from.")
@@ -282,9 +287,12 @@ class Run:
                 batches of another number of environments.
         """
         cfg = self.cfg
-        self._register(**components)
+        for name, component in components.items():
+            self.checkpoint.register(name, component)
         if cfg.resume:
             remove_leftovers(self.path)
+            if os.path.lexists(self.path / "log"):
+                regular_files(self.path / "log")  # or a link would be written through
             checkpoint = latest(self.path)
             if checkpoint is not None:
                 if "buffer" in self.checkpoint.components:
@@ -306,7 +314,7 @@ class Run:
                 wandb_kwargs={"project": cfg.logger.project_name, "dir": str(self.path)},
             )
         # Last: where the log cannot be opened, there is no run.
-        write_atomically(self.path / "config.yaml", OmegaConf.to_yaml(cfg, resolve=True))
+        write_config(self.path / CONFIG, cfg)
 
     @property
     def frames(self) -> int:
@@ -320,19 +328,13 @@ class Run:
 
     def _check_width(self) -> None:
         """The replay buffer has a column for every environment of a batch."""
-        saved, new = (
-            envs_per_batch(cfg) for cfg in (OmegaConf.load(self.path / "config.yaml"), self.cfg)
-        )
+        saved, new = (envs_per_batch(cfg) for cfg in (read_config(self.path / CONFIG), self.cfg))
         if saved != new:
             raise ValueError(
                 f"run_dir={self.cfg.run_dir} has replayed batches of {saved} environments and "
                 f"cannot go on with batches of {new}: leave env.num_envs as it was, with "
                 "collector.backend=multi_async env.num_envs / collector.num_workers."
             )
-
-    def _register(self, **components: Any) -> None:
-        for name, component in components.items():
-            self.checkpoint.register(name, component, adapter=adapter_of(component))
 
     def log(self, metrics: Mapping[str, float]) -> None:
         """Write metrics at the current frame."""
@@ -424,7 +426,7 @@ class Run:
 def load_policy(run_dir: str | os.PathLike[str]) -> GMMTanhPolicy:
     """The policy of a run, as its newest checkpoint has it.
 
-    Nothing is unpickled: weights are read as tensors, everything else as JSON and YAML.
+    Nothing is unpickled: weights are read as tensors, everything else as JSON.
 
     Args:
         run_dir (path): the run's folder.
@@ -433,30 +435,23 @@ def load_policy(run_dir: str | os.PathLike[str]) -> GMMTanhPolicy:
         FileNotFoundError: if it holds no run, or one without a checkpoint.
         CheckpointError: if the checkpoint is not what was written, or could run code.
     """
-    cfg, checkpoint = load_run(run_dir)
-    policy = make_policy(cfg, make_env(cfg, num_envs=1, seed=0))
-    load_component(checkpoint, "policy", policy)
-    return policy.eval().requires_grad_(False)
+    return from_newest(run_dir, saved_policy)
 
 
-def load_run(run_dir: str | os.PathLike[str]) -> tuple[DictConfig, Path]:
-    """A run's configuration and the path of its newest checkpoint.
-
-    A run is looked at on the CPU, wherever it was trained.
+def saved_policy(cfg: DictConfig, checkpoint: Path) -> GMMTanhPolicy:
+    """The policy of a checkpoint.
 
     Raises:
-        FileNotFoundError: if the folder holds no run, or one without a checkpoint.
-        CheckpointError: if the newest checkpoint cannot be read.
+        CheckpointError: if it is not what was written, or not finite.
     """
-    path = Path(run_dir)
-    if not (path / "config.yaml").exists():
-        raise FileNotFoundError(f"run_dir={run_dir} holds no run: it has no config.yaml.")
-    checkpoint = latest(path)
-    if checkpoint is None:
-        raise FileNotFoundError(f"run_dir={run_dir} has no checkpoint yet.")
-    cfg = OmegaConf.load(path / "config.yaml")
-    cfg.device = "cpu"
-    return cfg, checkpoint
+    if "policy" not in cfg:
+        raise CheckpointError(f"{printable(checkpoint)} has no mixture policy.")
+    policy = make_policy(cfg, make_env(cfg, num_envs=1, seed=0))
+    load_components(checkpoint, policy=policy)
+    for name, weight in policy.named_parameters():
+        if not weight.isfinite().all():
+            raise CheckpointError(f"{name} of the policy in {printable(checkpoint)} is not finite.")
+    return policy.eval().requires_grad_(False)
 
 
 class GracefulStop:

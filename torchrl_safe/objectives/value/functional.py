@@ -433,7 +433,8 @@ def _solve_recurrence(coefficient: Tensor, delta: Tensor, vectorized: bool) -> T
     By doubling: after each round ``delta[t]`` sums twice as many steps, ``coefficient[t]`` is the
     product of as many coefficients, and ``x[t]`` depends on ``x`` as many steps later. Blocks of
     that many steps then follow each other backwards in time. There is no division, so coefficients
-    of zero are harmless; what they multiply is not read, for it may be NaN. Zeros behind the last step spare every round a special case for its end.
+    of zero are harmless; what they multiply is not read, for it may be NaN. Zeros behind the last
+    step spare every round a special case for its end.
 
     Args:
         coefficient (Tensor): ``[T - 1, ...]``.

@@ -187,6 +187,14 @@ class TestPolicy:
         torch.testing.assert_close(action.amin(0), spec.space.low, atol=1e-3, rtol=0)
         torch.testing.assert_close(action.amax(0), spec.space.high, atol=1e-3, rtol=0)
 
+    def test_an_action_that_is_a_matrix(self):
+        """One state, one action of 2 x 3 numbers: not the three that the last dimension has."""
+        network = nn.Linear(5, 14)
+        policy = GMMTanhPolicy(network, Bounded(-1.0, 1.0, (2, 3)), num_components=2)
+        with pytest.raises(ValueError, match=r"action_spec has shape \(2, 3\).*\(14,\).*flat"):
+            policy(make_data())
+        assert policy(make_data(4, 2))["action"].shape == (4, 2, 3)  # agents
+
     def test_batched_spec(self):
         policy = make_policy(action_spec=SPEC.expand(8, 2))
         assert policy.spec["action"].shape == (2,)

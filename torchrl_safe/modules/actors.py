@@ -118,7 +118,8 @@ class GMMTanhPolicy(ProbabilisticActor):
         network (nn.Module): maps the tensors of ``in_keys`` to ``num_components * (1 + 2 * D)``
             features, the ``num_features`` of :class:`GMMParamExtractor`.
         action_spec (Bounded): the action's spec, whose last dimension is D and whose bounds the
-            actions fill. Leading dimensions, as of a batched environment's spec, must share them.
+            actions fill. Leading dimensions are a batch, as in the spec of a batched environment or
+            of agents, and must share them: an action that is a matrix has to be flattened.
             On an accelerator, pass the spec on the policy's device: the bounds do not move with it.
 
     Keyword Args:
@@ -136,7 +137,8 @@ class GMMTanhPolicy(ProbabilisticActor):
     Raises:
         TypeError: if ``action_spec`` is not a ``Bounded`` leaf of floating type.
         ValueError: if its bounds are infinite or differ along leading dimensions, or the mixture's
-            arguments are out of range.
+            arguments are out of range; when called, if the features have fewer batch dimensions
+            than the spec.
 
     .. note:: Under ``ExplorationType.DETERMINISTIC`` the action is
         :attr:`TanhGaussianMixture.deterministic_sample`; there is no ``MODE``.
@@ -186,7 +188,11 @@ class GMMTanhPolicy(ProbabilisticActor):
         TanhGaussianMixture(example[:, 0], example, example, **distribution_kwargs)
         # As ProbabilisticActor's own constructor, with another last module.
         super(ProbabilisticActor, self).__init__(
-            TensorDictModule(_Headed(network, extractor), in_keys=in_keys, out_keys=parameters),
+            TensorDictModule(
+                _Headed(network, extractor, action_spec.shape),
+                in_keys=in_keys,
+                out_keys=parameters,
+            ),
             _StoredAction(
                 in_keys=parameters,
                 out_keys=["action"] if out_keys is None else out_keys,
@@ -222,9 +228,22 @@ class _StoredAction(SafeProbabilisticModule):
 class _Headed(nn.Sequential):
     """A network of one or more inputs, then a head."""
 
+    def __init__(self, network: nn.Module, head: GMMParamExtractor, spec_shape: torch.Size) -> None:
+        super().__init__(network, head)
+        self.spec_shape = spec_shape
+
     def forward(self, *inputs: Tensor) -> tuple[Tensor, ...]:
         network, head = self
-        return head(network(*inputs))
+        features = network(*inputs)
+        if features.ndim < len(self.spec_shape):
+            raise ValueError(
+                f"action_spec has shape {tuple(self.spec_shape)}: an action of "
+                f"{self.spec_shape[-1]} numbers for each element of a batch. The network's "
+                f"features, of shape {tuple(features.shape)}, have no such batch. If one action is "
+                "an array, give the policy the spec of a flat action and reshape it in the "
+                "environment; agents need features of their own."
+            )
+        return head(features)
 
 
 def _single_action_spec(spec: TensorSpec) -> Bounded:

@@ -27,6 +27,7 @@ from torchrl_safe.objectives.value import (
     retrace_variance_reward,
     squared_td_error,
 )
+from torchrl_safe.objectives.value.utils import behaviour_log_prob
 
 VARIANCE_REWARDS = {"td_error": squared_td_error, "second_moment": retrace_variance_reward}
 
@@ -391,6 +392,8 @@ class CVaRCostLoss(LossModule):
                 else:
                     log_prob = policy.log_prob
                 options["policy_log_prob"] = log_prob
+                log_mu = behaviour_log_prob(tensordict, keys.log_prob, self.actor_network)
+                data.set(keys.log_prob, log_mu)
             cost = data.get(_next(keys.cost))
             terminated = data.get(_next(keys.terminated), data.get(_next(keys.done)))
 

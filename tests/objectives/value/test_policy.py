@@ -1,15 +1,20 @@
 from __future__ import annotations
 
+import math
+
 import pytest
 import torch
 from tensordict import TensorDict
 from torch import nn
+from torchrl.collectors import Collector
 from torchrl.data import Bounded
 from torchrl.modules import MLP, NormalParamExtractor, ProbabilisticActor, TanhNormal, ValueOperator
 from torchrl.modules.tensordict_module import SafeModule
+from torchrl.testing.mocking_classes import ContinuousActionVecMockEnv
 
 from torchrl_safe import CVaRCostLoss, GMMTanhPolicy, TsallisLoss
 from torchrl_safe.objectives.value import evaluate_policy
+from torchrl_safe.objectives.value.utils import behaviour_log_prob
 
 OBS, ACT = 3, 2
 SPEC = Bounded(-1, 1, (ACT,))
@@ -171,3 +176,45 @@ def test_next_states_that_were_not_kept(slices, shifted):
 def test_missing_entries(slices, key):
     with pytest.raises(KeyError, match=f"{key[-1] if isinstance(key, tuple) else key}.*(5, 8)"):
         evaluate_policy(slices.exclude(key), mixture_actor())
+
+
+@pytest.mark.parametrize("make_actor", [mixture_actor, tanh_normal_actor])
+@pytest.mark.parametrize("loss_class", [TsallisLoss, CVaRCostLoss])
+def test_random_frames_of_a_collector(slices, make_actor, loss_class):
+    """Zeros that a collector stored count as the uniform density on the box of the actor's spec."""
+    loss = make_loss(loss_class, make_actor())
+    random = torch.rand(5, 8) < 0.5
+    known = slices.copy()
+    known["action_log_prob"] = torch.where(random, -math.log(4.0), slices["action_log_prob"])
+    slices["action_log_prob"] = slices["action_log_prob"].masked_fill(random, 0.0)
+    policy = evaluate_policy(slices, loss.actor_network)
+    target, expected = (loss.compute_target(data, policy=policy) for data in (slices, known))
+    torch.testing.assert_close(target, expected)
+
+
+def test_random_frames_of_agents():
+    """A box for each agent."""
+    low, high = torch.zeros(3, ACT), torch.tensor([[1.0, 2.0], [3.0, 4.0], [5.0, 6.0]])
+    actor = tanh_normal_actor()
+    actor.spec["action"] = Bounded(low, high, (3, ACT))
+    data = TensorDict(
+        action=torch.rand(4, 6, 3, ACT), log_mu=torch.zeros(4, 6, 3), batch_size=[4, 6]
+    )
+    log_mu = behaviour_log_prob(data, "log_mu", actor)
+    expected = -torch.tensor([2.0, 12.0, 30.0]).log().expand(4, 6, 3)
+    torch.testing.assert_close(log_mu, expected)
+
+
+def test_random_frames_of_a_real_collector():
+    """What the collector stores is what is expected of it."""
+    env = ContinuousActionVecMockEnv()
+    spec = Bounded(-1.0, 1.0, env.action_spec.shape)
+    width = env.observation_spec["observation"].shape[-1]
+    policy = GMMTanhPolicy(nn.Linear(width, 1 + 2 * spec.shape[-1]), spec, num_components=1)
+    budget = {"frames_per_batch": 20, "total_frames": 20, "init_random_frames": 20}
+    collector = Collector(env, policy, **budget, auto_register_policy_transforms=False)
+    (data,) = list(collector)
+    collector.shutdown()
+    assert not data["action_log_prob"].any()
+    log_mu = behaviour_log_prob(data, "action_log_prob", policy)
+    torch.testing.assert_close(log_mu, torch.full((20,), -spec.shape[-1] * math.log(2.0)))

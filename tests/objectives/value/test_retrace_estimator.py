@@ -559,7 +559,7 @@ def test_bad_data() -> None:
         estimator(make_precomputed(1)[0])
     data = make_precomputed(4, 7)
     data["policy_log_prob"] = torch.randn(4, 7, ACT)
-    with pytest.raises(ValueError, match="log_pi must have shape"):
+    with pytest.raises(ValueError, match=r"'policy_log_prob'.*\(4, 7, 2\).*reward's \(4, 7, 1\)"):
         estimator(data)
 
 
@@ -1341,3 +1341,104 @@ def test_compile_in_a_loss() -> None:
     expected = estimate(data)
     compiled = torch.compile(estimate, backend="eager", fullgraph=True)
     torch.testing.assert_close(compiled(data), expected)
+
+
+def split_agents(data: TensorDict, agent: int) -> TensorDict:
+    """The trajectories of one agent."""
+    one = {key: data[key][:, :, agent] for key in ("policy_log_prob", "action_log_prob")}
+    one["state_action_value"] = data["state_action_value"][:, :, agent]
+    following = {key: data["next", key][:, :, agent] for key in ("reward", "state_value")}
+    ends = {key: data["next", key] for key in ("done", "terminated")}
+    shared = data["next", "done"].ndim == 3
+    following |= ends if shared else {key: end[:, :, agent] for key, end in ends.items()}
+    return TensorDict({**one, "next": following}, data.batch_size)
+
+
+@pytest.mark.parametrize("shared_ends", [False, True])
+@pytest.mark.parametrize("joint_density", [False, True])
+def test_agents_are_trajectories_of_their_own(shared_ends: bool, joint_density: bool) -> None:
+    """The reference is one estimate per agent."""
+    torch.manual_seed(0)
+    steps, agents = (4, 7), 3
+    done = torch.rand(*steps, *(() if shared_ends else (agents,)), 1) < 0.2
+    log_prob = torch.randn(*steps) if joint_density else torch.randn(*steps, agents)
+    data = TensorDict(
+        {
+            "policy_log_prob": log_prob,
+            "action_log_prob": torch.randn(*steps, agents),
+            "state_action_value": torch.randn(*steps, agents, 1),
+            "next": {
+                "reward": torch.randn(*steps, agents, 1),
+                "state_value": torch.randn(*steps, agents, 1),
+                "done": done,
+                "terminated": done & (torch.rand(done.shape) < 0.5),
+            },
+        },
+        steps,
+    )
+    estimator = RetraceEstimator(gamma=GAMMA, lmbda=LMBDA)
+    target = estimator.value_estimate(data)
+    if joint_density:
+        data["policy_log_prob"] = log_prob.unsqueeze(-1).expand(*steps, agents)
+    for agent in range(agents):
+        expected = estimator.value_estimate(split_agents(data, agent))
+        torch.testing.assert_close(target[:, :, agent], expected)
+
+
+@pytest.mark.parametrize("agents", [False, True])
+@pytest.mark.parametrize("feature", [False, True])
+def test_steps_of_several_frames(agents: bool, feature: bool) -> None:
+    """Discounts ``gamma ** n`` against a loop, with and without a last dimension of one."""
+    torch.manual_seed(0)
+    data = make_precomputed(4, 7)
+    steps = torch.randint(1, 4, (4, 7))
+    data["steps_to_next_obs"] = steps.unsqueeze(-1) if feature else steps
+    if agents:
+        for key in ("state_action_value", ("next", "reward"), ("next", "state_value")):
+            data[key] = torch.randn(4, 7, 2, 1)
+    target = RetraceEstimator(gamma=GAMMA, lmbda=LMBDA).value_estimate(data)
+    ratio = LMBDA * (data["policy_log_prob"] - data["action_log_prob"]).clamp(max=0).exp()
+    expected, following = torch.zeros_like(target), None
+    for t in reversed(range(7)):
+        gap = (
+            0
+            if following is None
+            else following * ratio[:, t + 1].view(4, *[1] * (2 + agents))[:, 0]
+        )
+        end, stop = (
+            data["next", key][:, t].view(4, *[1] * (1 + agents)) for key in ("done", "terminated")
+        )
+        value = torch.where(stop, 0, data["next", "state_value"][:, t])
+        discount = (GAMMA ** steps[:, t]).view(4, *[1] * (1 + agents))
+        expected[:, t] = data["next", "reward"][:, t] + discount * (
+            value + torch.where(end, 0, gap)
+        )
+        following = expected[:, t] - data["state_action_value"][:, t]
+    torch.testing.assert_close(target, expected)
+
+
+@pytest.mark.parametrize("average", [False, True])
+@pytest.mark.parametrize("dtype", [torch.int64, torch.uint8, torch.bool])
+def test_rewards_that_are_counts_or_flags(dtype: torch.dtype, average: bool) -> None:
+    data = make_precomputed(4, 7)
+    data["next", "reward"] = torch.rand(4, 7, 1) < 0.5
+    exact = data.clone()
+    exact["next", "reward"] = data["next", "reward"].float()
+    data["next", "reward"] = data["next", "reward"].to(dtype)
+    estimator = RetraceEstimator(gamma=GAMMA, lmbda=LMBDA, average_rewards=average)
+    torch.testing.assert_close(estimator.value_estimate(data), estimator.value_estimate(exact))
+
+
+def test_a_density_of_the_past_does_not_replace_the_actor() -> None:
+    """An entry beside an actor is used on request, an argument always."""
+    data = make_precomputed(4, 7)
+    policy = make_actor()
+    estimator = RetraceEstimator(gamma=GAMMA, lmbda=LMBDA, actor_network=policy)
+    expected = estimator.value_estimate(data.exclude("policy_log_prob"))
+    torch.testing.assert_close(estimator.value_estimate(data), expected)
+    given = data["policy_log_prob"]
+    entry = RetraceEstimator(gamma=GAMMA, lmbda=LMBDA).value_estimate(data)
+    assert not torch.allclose(entry, expected)
+    bare = data.exclude("policy_log_prob")
+    torch.testing.assert_close(estimator.value_estimate(bare, policy_log_prob=given), entry)
+    torch.testing.assert_close(estimator(bare, policy_log_prob=given)["value_target"], entry)

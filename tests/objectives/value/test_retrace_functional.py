@@ -625,3 +625,44 @@ class RandomMDP:
 
     def stored_cost(self) -> Tensor:
         return self.cost[self.state, self.action, self.successor]
+
+
+@pytest.mark.parametrize("vectorized", [True, False])
+@pytest.mark.parametrize("what", ["reward", "action_value", "next_state_value", "log_pi"])
+@pytest.mark.parametrize("value", [torch.nan, torch.inf, -torch.inf])
+def test_what_is_not_finite_stays_behind_its_cut(vectorized, what, value):
+    """Targets and gradients before the cut are those without it; its own trajectory shows it."""
+    torch.manual_seed(0)
+    steps, cut, bad = 40, 19, 25
+    done = torch.zeros(steps, 1, dtype=torch.bool)
+    done[cut] = True
+    names = ("log_pi", "log_mu", "action_value", "next_state_value", "reward")
+    data = {name: torch.randn(steps, 1, dtype=torch.float64) for name in names}
+
+    def estimate(data):
+        leaves = {name: tensor.clone().requires_grad_() for name, tensor in data.items()}
+        target = retrace_lambda_return_estimate(
+            0.99, 0.97, **leaves, done=done, terminated=~done & done, vectorized=vectorized
+        )
+        gradients = torch.autograd.grad(target[: cut + 1].sum(), leaves.values())
+        return target, [gradient[: cut + 1] for gradient in gradients]
+
+    expected, slopes = estimate(data)
+    data[what][bad] = value
+    target, gradients = estimate(data)
+    torch.testing.assert_close(target[: cut + 1], expected[: cut + 1])
+    torch.testing.assert_close(gradients, slopes)
+    if what != "log_pi":
+        assert not target[cut + 1 : bad].isfinite().any()
+
+
+@pytest.mark.parametrize("dtype", [torch.int64, torch.bool])
+def test_counts_and_flags_are_rewards(dtype):
+    torch.manual_seed(0)
+    reward = torch.rand(3, 9, 1) < 0.5
+    done = torch.rand(3, 9, 1) < 0.2
+    rest = [torch.randn(3, 9, 1) for _ in range(4)]
+    target = retrace_lambda_return_estimate(0.9, 0.9, *rest, reward.to(dtype), done)
+    assert target.dtype == torch.float32
+    expected = retrace_lambda_return_estimate(0.9, 0.9, *rest, reward.float(), done)
+    torch.testing.assert_close(target, expected)

@@ -27,7 +27,12 @@ from torchrl.objectives.value.advantages import (
 )
 
 from torchrl_safe.objectives.value.functional import retrace_lambda_return_estimate
-from torchrl_safe.objectives.value.utils import get_entry, get_time_dim, repair_next
+from torchrl_safe.objectives.value.utils import (
+    behaviour_log_prob,
+    get_entry,
+    get_time_dim,
+    repair_next,
+)
 
 if TYPE_CHECKING:
     from torchrl.objectives import LossModule
@@ -45,7 +50,9 @@ class RetraceEstimator(ValueEstimatorBase):
 
     * reward, ``done`` and ``terminated``: under ``"next"``; ``terminated`` falls back to ``done``;
     * log-density of the stored action under the policy that took it: ``"action_log_prob"``, or
-      the actor's own key for it. It cannot be computed;
+      the actor's own key for it. It cannot be computed. An exact zero is what collectors store for
+      the actions of ``init_random_frames``: if ``actor_network`` has a bounded spec, the density
+      there is that of its uniform draws;
     * log-density of the stored action under the current policy: the argument ``policy_log_prob``,
       or from ``actor_network``, or ``"policy_log_prob"``;
     * Q(s, a) of the stored action: from ``qvalue_network``, or ``"state_action_value"``;
@@ -61,6 +68,9 @@ class RetraceEstimator(ValueEstimatorBase):
     A flat batch ``[B * T]`` of slices gives the same targets as ``[B, T]`` if ``done`` marks the
     end of every slice, as :class:`~torchrl.data.SliceSampler` does. Steps must follow each other in
     time: in a batch of unrelated transitions, traces would mix what does not belong together.
+
+    Agents have a dimension after time: rewards ``[*B, T, A, 1]`` and log-densities ``[*B, T, A]``.
+    Ends and discounts may be those of all agents, ``[*B, T, 1]``.
 
     With an entry ``"steps_to_next_obs"`` (n-step transitions) the discount of a step is
     ``gamma ** steps_to_next_obs``, as in TorchRL's other estimators. The rewards that such a step
@@ -468,33 +478,41 @@ class RetraceEstimator(ValueEstimatorBase):
         time_dim: int,
     ) -> Tensor:
         keys = self.tensor_keys
-        reward = get_entry(tensordict, ("next", keys.reward), "the reward")
+        reward = get_entry(tensordict, ("next", keys.reward), "the reward, [*B, T, 1]")
+        if not reward.is_floating_point():
+            reward = reward.to(next_value.dtype)
         gamma = self.gamma
         steps = tensordict.get(keys.steps_to_next_obs, None)
         if steps is not None:
-            gamma = gamma ** steps.view_as(reward)
+            gamma = gamma ** _of_steps(keys.steps_to_next_obs, steps, reward, tensordict)
         if self.average_rewards:
             groups = self._group_ids(tensordict)
             if groups is None:
                 reward = (reward - reward.mean()) / reward.std().clamp_min(1e-4)
             else:
                 reward = _standardize_by_group(reward, groups)
-        log_mu = get_entry(
-            tensordict,
-            keys.sample_log_prob,
-            "the log-density of the action under the policy that took it (collect with an actor "
-            "built with return_log_prob=True)",
+        log_mu = behaviour_log_prob(tensordict, keys.sample_log_prob, self.actor_network)
+        done = get_entry(tensordict, ("next", keys.done), "the end of trajectories, [*B, T, 1]")
+        terminated = tensordict.get(unravel_key(("next", keys.terminated)), done)
+        log_pi, log_mu, done, terminated = (
+            _of_steps(key, tensor, reward, tensordict)
+            for key, tensor in (
+                (keys.policy_log_prob, log_pi),
+                (keys.sample_log_prob, log_mu),
+                (("next", keys.done), done),
+                (("next", keys.terminated), terminated),
+            )
         )
         return retrace_lambda_return_estimate(
             gamma,
             self.lmbda,
             log_pi,
-            _with_feature(log_mu, tensordict),
+            log_mu,
             action_value,
             next_value,
             reward,
-            get_entry(tensordict, ("next", keys.done), "the end of trajectories"),
-            tensordict.get(unravel_key(("next", keys.terminated)), None),
+            done.expand_as(reward),
+            terminated.expand_as(reward),
             vectorized=self.vectorized,
             time_dim=time_dim,
         )
@@ -513,13 +531,13 @@ class RetraceEstimator(ValueEstimatorBase):
 
     def _policy_log_prob(self, tensordict: TensorDictBase, given: Tensor | None) -> Tensor:
         if given is not None:
-            return _with_feature(given, tensordict)
+            return given
         key, actor = self.tensor_keys.policy_log_prob, self.actor_network
         has_density = hasattr(actor, "get_dist")
         if skip_existing() or not has_density:
             log_prob = tensordict.get(key, None)
             if log_prob is not None:
-                return _with_feature(log_prob, tensordict)
+                return log_prob
         if not has_density:
             raise KeyError(
                 f"{key!r}, the log-density of the stored action under the current policy, is not "
@@ -529,7 +547,7 @@ class RetraceEstimator(ValueEstimatorBase):
             )
         action = get_entry(tensordict, self.tensor_keys.action, "the stored action")
         with torch.no_grad():
-            return _with_feature(self._policy(tensordict).log_prob(action), tensordict)
+            return self._policy(tensordict).log_prob(action)
 
     def _policy(self, tensordict: TensorDictBase) -> Any:
         """The current policy's distribution."""
@@ -620,8 +638,8 @@ class RetraceEstimator(ValueEstimatorBase):
         def call(states: TensorDictBase) -> Tensor:
             with torch.no_grad():
                 dist = self._policy(states)
-                log_pi = _with_feature(dist.log_prob(states.get(action_key)), states)
                 value = self._call_critic(states, params)
+                log_pi = dist.log_prob(states.get(action_key)).reshape(*value.shape[:-1], 1)
                 if self.action_space is None:
                     state_value = self._expected_value(dist, states, params)
                 else:
@@ -697,3 +715,26 @@ def _select(tensordict: TensorDictBase, module: TensorDictModule, name: str) -> 
 
 def _with_feature(tensor: Tensor, tensordict: TensorDictBase) -> Tensor:
     return tensor.unsqueeze(-1) if tensor.shape == tensordict.batch_size else tensor
+
+
+def _of_steps(key: NestedKey, tensor: Tensor, reward: Tensor, tensordict: TensorDictBase) -> Tensor:
+    """What steps have in common, aligned with a reward ``[*B, T, ..., F]``: as it, or ``F = 1``.
+
+    One number per step ``[*B, T]``, or one per step and agent ``[*B, T, A]``.
+    """
+    shape, batch = tensor.shape, tensordict.batch_size
+    for size in (1, reward.shape[-1]):
+        target = (*reward.shape[:-1], size)
+        if shape == target:
+            return tensor
+        if shape == target[:-1]:
+            return tensor.unsqueeze(-1)
+        if shape in (batch, (*batch, size)):  # shared by all agents
+            between = (1,) * (reward.ndim - len(batch) - 1)
+            return tensor.reshape(*batch, *between, *shape[len(batch) :] or (1,)).expand(target)
+    raise ValueError(
+        f"{unravel_key(key)!r} has shape {tuple(shape)}, which does not fit the reward's "
+        f"{tuple(reward.shape)} in a tensordict of batch size {tuple(batch)}: it needs one number "
+        f"per step, {tuple(batch)}, or the shape {tuple(reward.shape[:-1])}. Where agents share a "
+        "reward, add up their log-densities."
+    )

@@ -51,7 +51,7 @@ def retrace_lambda_return_estimate(
     Every argument is aligned with its own step ``t``; the shift to ``t + 1`` is made within.
     ``done`` cuts the trace and ``terminated`` masks the bootstrap: a truncated step, wherever it
     lies in the batch, bootstraps from its own ``next_state_value`` and never reads the trajectory
-    stored after it. The trace ends with the last step.
+    stored after it, even if that is NaN. The trace ends with the last step.
 
     The result is differentiable in every floating-point argument. ``bfloat16`` and ``float16`` are
     computed in ``float32``, because a discount near 1 is not representable in them.
@@ -67,7 +67,7 @@ def retrace_lambda_return_estimate(
         action_value (Tensor): :math:`Q(s_t, a_t)`, ``[*B, T, F]``.
         next_state_value (Tensor): :math:`V(s_{t+1})`, the value of the next state under the
             current policy, ``[*B, T, F]``. Not read where ``terminated`` (may be NaN there).
-        reward (Tensor): reward of the step, ``[*B, T, F]``.
+        reward (Tensor): reward of the step, ``[*B, T, F]``; a count or a flag counts as a number.
         done (Tensor): boolean end of trajectory: termination, truncation or end of a slice,
             ``[*B, T, F]``.
         terminated (Tensor, optional): boolean end of episode, ``[*B, T, F]``. Defaults to ``done``.
@@ -79,7 +79,8 @@ def retrace_lambda_return_estimate(
         time_dim (int): the dimension of time, any but the last. Defaults to ``-2``.
 
     Returns:
-        Tensor: the targets, ``[*B, T, F]``.
+        Tensor: the targets, ``[*B, T, F]``, in the type of the reward, or of the values if rewards
+        are no floating-point numbers.
 
     Raises:
         TypeError: if ``done`` or ``terminated`` is not boolean.
@@ -403,7 +404,9 @@ def _trace_return_estimate(
     gamma = _coefficient("gamma", gamma, shape)
     lmbda = _coefficient("lmbda", lmbda, shape)
 
-    dtype = reward.dtype
+    # A count or a flag is a reward, too; its targets are no integers.
+    dtype = (reward if reward.is_floating_point() else next_state_value).dtype
+    reward = reward.to(dtype)
     if dtype in (torch.bfloat16, torch.float16):
         log_trace, action_value, next_state_value, reward = (
             tensor.float() for tensor in (log_trace, action_value, next_state_value, reward)
@@ -415,10 +418,11 @@ def _trace_return_estimate(
     log_trace, action_value, target, done = (
         tensor.movedim(time_dim, 0) for tensor in (log_trace, action_value, target, done)
     )
-    # Across a cut the ratio is another trajectory's: masking it before the exponential stops its
-    # gradient too, and a NaN in either.
+    # Across a cut ratio and value are another trajectory's: masking them before they are used stops
+    # their gradients too, and a NaN in either.
     trace = torch.where(done[:-1], -torch.inf, log_trace[1:]).exp() * decay
-    head = torch.addcmul(target[:-1], trace, action_value[1:], value=-1)
+    following = torch.where(done[:-1], 0, action_value[1:])
+    head = torch.addcmul(target[:-1], trace, following, value=-1)
     solution = _solve_recurrence(trace, torch.cat([head, target[-1:]]), vectorized)
     return solution.movedim(0, time_dim).contiguous().to(dtype)
 
@@ -429,7 +433,8 @@ def _solve_recurrence(coefficient: Tensor, delta: Tensor, vectorized: bool) -> T
     By doubling: after each round ``delta[t]`` sums twice as many steps, ``coefficient[t]`` is the
     product of as many coefficients, and ``x[t]`` depends on ``x`` as many steps later. Blocks of
     that many steps then follow each other backwards in time. There is no division, so coefficients
-    of zero are harmless. Zeros behind the last step spare every round a special case for its end.
+    of zero are harmless; what they multiply is not read, for it may be NaN. Zeros behind the last
+    step spare every round a special case for its end.
 
     Args:
         coefficient (Tensor): ``[T - 1, ...]``.
@@ -451,13 +456,15 @@ def _solve_recurrence(coefficient: Tensor, delta: Tensor, vectorized: bool) -> T
     delta = torch.cat([delta, zeros[1:]])
     for stride in strides:
         head = coefficient[:-stride]
-        delta = torch.addcmul(delta[:-stride], head, delta[stride:])
+        following = delta[stride:].masked_fill(head == 0, 0)
+        delta = torch.addcmul(delta[:-stride], head, following)
         coefficient = head * coefficient[stride:]
     *terms, following = delta.split(block)
     *factors, _ = coefficient.split(block)
+    *cuts, _ = (coefficient == 0).split(block)
     solution = [following[: (steps - 1) % block + 1]]
-    for factor, term in zip(reversed(factors), reversed(terms), strict=True):
-        following = torch.addcmul(term, factor, following)
+    for factor, cut, term in zip(*map(reversed, (factors, cuts, terms)), strict=True):
+        following = torch.addcmul(term, factor, following.masked_fill(cut, 0))
         solution.append(following)
     return torch.cat(solution[::-1])
 

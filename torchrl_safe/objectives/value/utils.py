@@ -6,8 +6,10 @@ from collections.abc import Sequence
 
 import torch
 from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModule
 from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor
+from torchrl.data import Bounded
 
 
 def get_entry(tensordict: TensorDictBase, key: NestedKey, what: str) -> Tensor:
@@ -21,6 +23,36 @@ def get_entry(tensordict: TensorDictBase, key: NestedKey, what: str) -> Tensor:
             f"{tuple(tensordict.batch_size)}, which has {present}."
         )
     return value
+
+
+def behaviour_log_prob(
+    tensordict: TensorDictBase, key: NestedKey, actor: TensorDictModule | None
+) -> Tensor:
+    """Log-density of the stored action under what took it: a policy, or a uniform draw.
+
+    For the actions of ``init_random_frames``, TorchRL's collectors store zeros in the place of what
+    the policy would have written. No density of a continuous action is zero exactly but for a
+    uniform one on a box of volume 1. Where the actor's spec is a box, zeros therefore become the
+    log-density of its ``rand()``.
+    """
+    log_prob = get_entry(
+        tensordict,
+        key,
+        "the log-density of the action under the policy that took it, [*B, T] (collect with an "
+        "actor built with return_log_prob=True)",
+    )
+    specs, action_keys = getattr(actor, "spec", None), getattr(actor, "dist_sample_keys", [])
+    if specs is None or len(action_keys) != 1:
+        return log_prob
+    spec, action = specs[action_keys[0]], tensordict.get(action_keys[0], None)
+    if action is None or not isinstance(spec, Bounded) or not spec.dtype.is_floating_point:
+        return log_prob
+    event_ndim = min(max(action.ndim - log_prob.ndim, 1), spec.ndim)
+    width = spec.space.high - spec.space.low
+    log_volume = width.log().sum(tuple(range(-event_ndim, 0))).to(log_prob)
+    if log_volume.ndim and log_prob.shape[-log_volume.ndim :] != log_volume.shape:
+        log_volume = log_volume.flatten()[0]  # of a batched environment's spec: all are the same
+    return torch.where(log_prob == 0, -log_volume, log_prob)
 
 
 def get_time_dim(tensordict: TensorDictBase, time_dim: int | None = None) -> int:

@@ -454,6 +454,8 @@ class TestBadInput:
                 env.reset(seed=-1)
         with pytest.raises(ValueError, match="seed must be one or 3, got 2 of them"):
             make_vec().reset(seed=[1, 2])
+        with pytest.raises(ValueError, match=r"seed must be None or an integer >= 0, got 1\.5"):
+            make_vec().reset(seed=1.5)
         for bad in (-1, 0.5, "a"):
             with pytest.raises(ValueError, match=r"seed\[1\] must be None or an integer >= 0"):
                 make_vec().reset(seed=[1, bad, 2])

@@ -13,8 +13,8 @@ import pytest
 import torch
 from torchrl.envs import (
     DMControlWrapper,
-    GymEnv,
     FrameSkipTransform,
+    GymEnv,
     GymWrapper,
     RenameTransform,
     RewardSum,
@@ -254,7 +254,7 @@ class TestSeveralCosts:
             make({})
         with pytest.raises(ValueError, match=r"by strings, got \[1\]"):
             make({1: "cost"})
-        with pytest.raises(TypeError, match="a key in info or a function of it, got 0.5"):
+        with pytest.raises(TypeError, match=r"a key in info or a function of it, got 0\.5"):
             make({"torque": 0.5})
         with pytest.raises(ValueError, match=r"must be for \['torque'\], got \['speed'\]"):
             make({"torque": "torque"}, violation_above={"speed": 1.0})

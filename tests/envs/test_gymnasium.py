@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+import json
 import pickle
 
 import gymnasium
@@ -63,9 +65,233 @@ class TestRegistration:
 
 
 @pytest.mark.parametrize("robot", ROBOTS)
+@pytest.mark.filterwarnings("ignore:.*A Box observation space m..imum value is -?infinity")
 def test_gymnasiums_checker(robot):
-    """Without a warning, as they are errors here. Its render checks are in test_render."""
+    """With one warning, of what is so. Its render checks are in test_render."""
     check_env(gymnasium.make(identifier(robot)).unwrapped, skip_render_check=True)
+
+
+class TestLength:
+    """Gymnasium has a name for it, and whoever reads the spec must find what is so."""
+
+    @staticmethod
+    def steps(env) -> int:
+        env.reset(seed=0)
+        for count in range(1, 2_000):
+            *_, terminated, truncated, _ = env.step(0.0 * env.action_space.sample())
+            if np.any(terminated | truncated):
+                return count
+        return 0
+
+    @pytest.mark.parametrize(
+        ("options", "length"),
+        [
+            ({}, 1000),
+            ({"episode_length": 7}, 7),
+            ({"episode_length": 1_200}, 1_200),
+            ({"max_episode_steps": 7}, 7),
+            ({"max_episode_steps": 7, "episode_length": 7}, 7),
+        ],
+    )
+    @pytest.mark.parametrize("make", [gymnasium.make, gymnasium.make_vec])
+    def test_is_what_the_spec_says(self, make, options, length):
+        env = make(POINT, **options)
+        assert self.steps(env) == length
+        assert env.spec.max_episode_steps == length
+        assert make(env.spec).spec.max_episode_steps == length
+
+    def test_cut_from_outside(self):
+        options = {"max_episode_steps": 5, "vectorization_mode": "sync"}
+        assert self.steps(gymnasium.make_vec(POINT, num_envs=2, **options)) == 5
+
+    def test_the_task_knows_it(self):
+        """A collision counts for the steps that would have remained."""
+        envs = [
+            gymnasium.make_vec(identifier("jackal"), num_envs=8, num_threads=1, **{name: 300})
+            for name in ("episode_length", "max_episode_steps")
+        ]
+        for env in envs:
+            env.reset(seed=0)
+        for step in range(300):
+            action = np.tile(np.float32([1.0, 0.0]), (8, 1))
+            (*_, terminated, _, infos), (*_, infos_too) = (env.step(action) for env in envs)
+            assert (infos["violations"] == infos_too["violations"]).all()
+            if terminated.any():
+                assert (infos["violations"][terminated] == 300 - step).all()
+                return
+        pytest.fail("no robot met anything")
+
+    def test_rejects(self):
+        with pytest.raises(ValueError, match="two names of one thing, got 5 and 6"):
+            make_vec(episode_length=5, max_episode_steps=6)
+        with pytest.raises(ValueError, match="max_episode_steps must be at least 1, got -1"):
+            make_vec(max_episode_steps=-1)
+
+
+class TestBounds:
+    """Nothing bounds where a robot is, and wrappers that divide by bounds must hear of it."""
+
+    def test_wrappers_refuse(self):
+        with pytest.raises(ValueError, match="unbounded"):
+            gymnasium.wrappers.RescaleObservation(
+                gymnasium.make(POINT), np.float32(-1), np.float32(1)
+            )
+        with pytest.raises(ValueError, match="to be finite"):
+            gymnasium.wrappers.DiscretizeObservation(gymnasium.make(POINT), bins=5)
+
+    def test_wrappers_that_measure(self):
+        env = gymnasium.wrappers.NormalizeObservation(gymnasium.make(POINT))
+        env.reset(seed=0)
+        seen = np.array([env.step(env.action_space.sample())[0] for _ in range(200)])
+        assert np.abs(seen).max() > 0.1
+
+
+class TestResetIsNoStep:
+    """Whoever adds up infos has n costs for n rewards."""
+
+    @staticmethod
+    def plain(num_envs, seeds, steps, length) -> np.ndarray:
+        """Sums of reward and cost over the steps of single environments, [2, N]."""
+        sums = np.zeros((2, num_envs))
+        for row, seed in enumerate(seeds):
+            env = GymGoalEnv(episode_length=length)
+            env.reset(seed=seed)
+            count = 0
+            while count < steps:
+                _, reward, _, truncated, info = env.step(np.ones(2))
+                sums[:, row] += reward, info["cost"]
+                count += 1
+                if truncated:
+                    env.reset()
+                    count += 1  # which takes a step of NEXT_STEP
+        return sums
+
+    @pytest.mark.parametrize("mode", ["sync", "vector_entry_point"])
+    def test_next_step(self, mode):
+        seeds = [4, 5]
+        envs = gymnasium.make_vec(POINT, num_envs=2, vectorization_mode=mode, episode_length=3)
+        envs.reset(seed=seeds)
+        sums = np.zeros((2, 2))
+        for step in range(1, 9):
+            _, rewards, _, _, infos = envs.step(np.ones((2, 2), np.float32))
+            sums += rewards, infos["cost"]
+            assert infos["_cost"].all()
+            assert (infos["cost"] == 0).all() == (step % 4 == 0)
+            if step % 4 == 0:
+                assert not (infos["violation"] | infos["goal_met"]).any()
+                assert (infos["violations"] == 0).all()
+        assert sums == pytest.approx(self.plain(2, seeds, 8, 3))
+
+    def test_after_a_reset(self):
+        zero = {"cost": 0.0, "violation": False, "violations": 0, "goal_met": False}
+        env, envs = GymGoalEnv(), make_vec(autoreset_mode="Disabled")
+        assert env.reset(seed=0)[1] == zero
+        env.reset()[1]["cost"] = 9.0
+        assert env.reset()[1] == zero
+        _, infos = envs.reset(seed=0)
+        assert all((infos[name] == 0).all() and infos[f"_{name}"].all() for name in zero)
+        # Of those that are left alone, it says as little as Gymnasium's own.
+        envs.step(envs.action_space.sample())
+        mask = np.array([True, False, True])
+        _, infos = envs.reset(options={"reset_mask": mask})
+        assert all((infos[name] == 0).all() for name in zero)
+        assert all((infos[f"_{name}"] == mask).all() for name in zero)
+
+
+class TestSeeds:
+    """Of vector environments, against Gymnasium's own and against single ones."""
+
+    @staticmethod
+    def sync(num_envs=3):
+        mode = gymnasium.vector.AutoresetMode.DISABLED
+        return gymnasium.make_vec(
+            POINT,
+            num_envs=num_envs,
+            vectorization_mode="sync",
+            vector_kwargs={"autoreset_mode": mode},
+        )
+
+    @pytest.mark.parametrize("kind", [list, tuple, np.array])
+    def test_one_for_each(self, kind):
+        envs, singles = make_vec(autoreset_mode="Disabled"), [GymGoalEnv() for _ in range(3)]
+        seeds = [9, 9, 2]
+        expected = np.array([env.reset(seed=s)[0] for env, s in zip(singles, seeds, strict=True)])
+        found, _ = envs.reset(seed=kind(seeds))
+        assert (found == expected).all()
+        assert (self.sync().reset(seed=seeds)[0] == expected).all()
+        # And the episodes after it.
+        assert (envs.reset()[0] == np.array([env.reset()[0] for env in singles])).all()
+
+    def test_none_goes_on(self):
+        envs, singles = make_vec(), [GymGoalEnv() for _ in range(3)]
+        for env, seed in zip(singles, [1, 2, 3], strict=True):
+            env.reset(seed=seed)
+        envs.reset(seed=[1, 2, 3])
+        expected = [singles[0].reset(seed=7)[0], singles[1].reset()[0], singles[2].reset()[0]]
+        assert (envs.reset(seed=[7, None, None])[0] == np.array(expected)).all()
+
+    @pytest.mark.parametrize("seed", [7, [7, 8, 9], [7, None, 9]])
+    def test_a_masked_reset_seeds_what_it_resets(self, seed):
+        mask = np.array([True, False, False])
+        envs, reference = make_vec(autoreset_mode="Disabled"), make_vec(autoreset_mode="Disabled")
+        for env in (envs, reference):
+            env.reset(seed=[1, 2, 3])
+        first, _ = envs.reset(seed=seed, options={"reset_mask": mask})
+        again, _ = envs.reset(seed=seed, options={"reset_mask": mask})
+        assert (first[0] == again[0]).all()
+        assert (envs.reset()[0][1:] == reference.reset()[0][1:]).all()
+        whole = make_vec().reset(seed=seed)[0]
+        assert (first[0] == whole[0]).all()
+
+    def test_options_are_left_alone(self):
+        options = {"reset_mask": np.array([True, False, False])}
+        make_vec().reset(options=options)
+        assert list(options) == ["reset_mask"]
+
+
+@pytest.mark.parametrize("make", [GymGoalEnv, make_vec], ids=["single", "vector"])
+class TestCopies:
+    @pytest.mark.parametrize("clone", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))])
+    @pytest.mark.parametrize("drawn", [False, True])
+    def test_go_on_alike(self, make, clone, drawn):
+        env = make(render_mode="rgb_array")
+        env.reset(seed=0)
+        action = np.full(env.action_space.shape, 0.5, np.float32)
+        env.step(action)
+        if drawn:
+            before = env.render()
+        other = clone(env)
+        assert (env.step(action)[0] == other.step(action)[0]).all()
+        assert (env.reset()[0] == other.reset()[0]).all()
+        if drawn:
+            assert (np.array(env.render()) == np.array(other.render())).all()
+            assert np.array(before).shape == np.array(other.render()).shape
+        # Neither moves the other.
+        env.step(action)
+        assert (other.step(action)[0] == env._core.frame.observation.squeeze()).all()
+        env.close()
+        other.step(action)
+        other.close()
+
+    def test_closed(self, make):
+        env = make(render_mode="rgb_array")
+        env.reset(seed=0)
+        env.close()
+        env.close()
+        for call in (env.reset, lambda: env.step(env.action_space.sample()), env.render):
+            with pytest.raises(RuntimeError, match="the environment is closed: make another"):
+                call()
+
+
+def test_made_ones_copy():
+    env = gymnasium.make(POINT, render_mode="rgb_array", episode_length=9)
+    env.reset(seed=0)
+    env.render()
+    other = copy.deepcopy(env)
+    assert other.spec.max_episode_steps == 9
+    assert (env.step(np.ones(2))[0] == other.step(np.ones(2))[0]).all()
+    env.close()
+    other.close()
 
 
 class TestEnv:
@@ -75,11 +301,25 @@ class TestEnv:
         *_, stepped = env.step(env.action_space.sample())
         for found in (info, stepped):
             assert {k: type(v) for k, v in found.items()} == {
-                "cost": np.float64,
-                "violation": np.bool_,
-                "violations": np.int64,
-                "goal_met": np.bool_,
+                "cost": float,
+                "violation": bool,
+                "violations": int,
+                "goal_met": bool,
             }
+            assert json.loads(json.dumps(found)) == found
+
+    @pytest.mark.parametrize("mode", ["sync", "vector_entry_point"])
+    def test_info_in_arrays(self, mode):
+        envs = gymnasium.make_vec(POINT, num_envs=2, vectorization_mode=mode)
+        envs.reset(seed=0)
+        *_, infos = envs.step(envs.action_space.sample())
+        assert {k: v.dtype for k, v in infos.items() if k[0] != "_"} == {
+            "cost": np.float64,
+            "violation": np.bool_,
+            "violations": np.int64,
+            "goal_met": np.bool_,
+        }
+        envs.close()
 
     def test_seeds(self):
         env, other = gymnasium.make(POINT), gymnasium.make(POINT)
@@ -99,13 +339,6 @@ class TestEnv:
         env.restore(snapshot)
         assert (env.layout()["robot"] == layout["robot"]).all()
         assert (np.array(first) == [env.step(np.array([1.0, 0.3]))[0] for _ in range(3)]).all()
-
-    def test_pickles(self):
-        env = GymGoalEnv()
-        env.reset(seed=0)
-        copy = pickle.loads(pickle.dumps(env))
-        action = np.array([0.5, 0.5], np.float32)
-        assert (env.step(action)[0] == copy.step(action)[0]).all()
 
 
 class TestVectorEnv:
@@ -219,8 +452,13 @@ class TestBadInput:
                 env.reset(options={"layout": 1})
             with pytest.raises(ValueError, match="seed must be None or an integer >= 0"):
                 env.reset(seed=-1)
-        with pytest.raises(TypeError, match="seed must be one integer or None"):
-            make_vec().reset(seed=[1, 2, 3])
+        with pytest.raises(ValueError, match="seed must be one or 3, got 2 of them"):
+            make_vec().reset(seed=[1, 2])
+        with pytest.raises(ValueError, match=r"seed must be None or an integer >= 0, got 1\.5"):
+            make_vec().reset(seed=1.5)
+        for bad in (-1, 0.5, "a"):
+            with pytest.raises(ValueError, match=r"seed\[1\] must be None or an integer >= 0"):
+                make_vec().reset(seed=[1, bad, 2])
         for mask in (np.ones(2, bool), np.ones(3)):
             with pytest.raises(
                 ValueError, match=r"reset_mask must be a bool array of shape \(3,\)"

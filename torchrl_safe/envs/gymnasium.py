@@ -100,7 +100,7 @@ class GymGoalEnv(gymnasium.Env[NDArray[Any], NDArray[Any]]):
         self._closed = False
 
     @property
-    def spec(self) -> EnvSpec | None:  # type: ignore[override]
+    def spec(self) -> EnvSpec | None:
         """What ``gymnasium.make`` was told, with the steps of an episode."""
         return self._spec
 
@@ -314,7 +314,7 @@ class GymGoalVectorEnv(gymnasium.vector.VectorEnv[NDArray[Any], NDArray[Any], ND
         self._renderer: Any = None
 
     @property
-    def spec(self) -> EnvSpec | None:  # type: ignore[override]
+    def spec(self) -> EnvSpec | None:
         """What ``gymnasium.make_vec`` was told, with the steps of an episode."""
         return self._spec
 
@@ -362,19 +362,20 @@ class GymGoalVectorEnv(gymnasium.vector.VectorEnv[NDArray[Any], NDArray[Any], ND
 
     def _seed(self, seed: int | Sequence[int | None] | None, mask: Mask) -> None:
         """Restarts the random streams of the environments in ``mask`` that have a seed."""
-        if isinstance(seed, (list, tuple, np.ndarray)):
-            if len(seed) != self.num_envs:
-                raise ValueError(f"seed must be one or {self.num_envs}, got {len(seed)} of them.")
-            for row, own in enumerate(seed):
-                check_seed(f"seed[{row}]", own)
-            mask = mask & np.array([own is not None for own in seed])
-            fresh = np.concatenate([RandomStreams(own, 1).state for own in seed])
-        else:
+        if not isinstance(seed, (Sequence, np.ndarray)):
             check_seed("seed", seed)
             if seed is None:
                 return
             super().reset(seed=int(seed))
             fresh = RandomStreams(seed, self.num_envs).state
+        else:
+            seeds = list(seed)
+            if len(seeds) != self.num_envs:
+                raise ValueError(f"seed must be one or {self.num_envs}, got {len(seeds)} of them.")
+            for row, own in enumerate(seeds):
+                check_seed(f"seed[{row}]", own)
+            mask = mask & np.array([own is not None for own in seeds])
+            fresh = np.concatenate([RandomStreams(own, 1).state for own in seeds])
         self._core.rewind(mask, fresh)
 
     def step(
@@ -493,7 +494,7 @@ def _no_options(options: dict[str, Any] | None) -> None:
 
 def _arrays(frame: Frame, stepped: Mask, shown: Mask) -> dict[str, Any]:
     """What the steps of the environments ``stepped`` brought, and Gymnasium's masks, [N] each."""
-    infos = {}
+    infos: dict[str, Any] = {}
     for name in _NO_STEP:
         value = getattr(frame, name).copy()
         value[~stepped] = 0

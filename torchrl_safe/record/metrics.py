@@ -34,6 +34,7 @@ __all__ = [
 ]
 
 _NUM_RESAMPLES = 2_000
+_OPTIONAL = {("next", "goal_met")}  # not every environment has goals
 
 
 def score(episode_return: Tensor, violations: Tensor) -> Tensor:
@@ -155,7 +156,7 @@ def evaluate(
     Args:
         env (EnvBase): batch size [\*N], with leaves of shape [\*N, 1] ``("next", "reward")``,
             ``("next", "cost")``, ``("next", "violation")`` or ``("next", "violations")``, and
-            ``("next", "goal_met")``.
+            ``("next", "goal_met")`` if there are goals. Of several costs, rename one to ``"cost"``.
         policy (callable): from tensordict to tensordict with the action. Put a policy with
             dropout or the like in ``eval()`` mode first.
 
@@ -355,6 +356,8 @@ def _violations(td: TensorDictBase) -> Tensor:
 def _signal(td: TensorDictBase, key: NestedKey) -> Tensor:
     """The leaf ``key`` of shape [*B, 1] as [*B]."""
     value = td.get(key, None)
+    if value is None and key in _OPTIONAL:
+        return torch.zeros(td.batch_size, dtype=torch.bool, device=td.device)
     if value is None:
         raise KeyError(f"{key} is missing; the tensordict has {sorted(map(str, td.keys(True)))}.")
     if value.shape != (*td.batch_size, 1):

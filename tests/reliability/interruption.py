@@ -83,10 +83,7 @@ def saved_frames(run_dir: Path) -> int:
     """Frames of the newest checkpoint, of which every file is what was written."""
     newest = checkpoints.latest(run_dir)
     for checkpoint in (run_dir / "checkpoints").glob("checkpoint-*"):
-        manifest = json.loads((checkpoint / "manifest.json").read_text())
-        for record in manifest["components"].values():
-            assert (checkpoint / record["path"] / checkpoints.DIGESTS).exists()
-            checkpoints.check_seal(checkpoint / record["path"])
+        checkpoints.check_checkpoint(checkpoint)
     return int(newest.name.split("-")[1]) if newest else 0
 
 

@@ -166,7 +166,7 @@ def test_feasible_problems_match_a_general_solver(m, count):
 
 
 def general_solver(objective, slope, v, d, radius, starts):
-    """Least ``objective(y)`` under ``v y <= -d`` and ``|y| <= radius``; ``None`` if none is found."""
+    """Least ``objective(y)`` under ``v y <= -d``, ``|y| <= radius``; ``None`` if none is found."""
     found = None
     for start in starts:
         result = minimize(
@@ -231,7 +231,7 @@ def test_recovery_removes_what_it_can_and_lowers_the_sum_of_the_rest(m, ratio):
 
 
 def blocked(rng, kind, n=8):
-    """Unit gradients [3, n] of which those of the first two, or of the first, cannot be followed."""
+    """Unit gradients [3, n]: the first, or the first two, cannot be followed."""
     v = np.linalg.qr(rng.normal(size=(n, 3)))[0].T
     if kind == "flat":
         v[0] = 0.0

@@ -251,7 +251,7 @@ def matched_bound_kl(
         new_scale (Tensor): ``[*B, K, D]``.
 
     Returns:
-        The bound on ``KL(old || new)`` in nats, ``[*B]``.
+        The bound on ``KL(old || new)`` in nats, ``[*B]``; float32 for half types.
 
     Raises:
         ValueError: if shapes disagree.
@@ -303,7 +303,7 @@ def moment_matched_kl(
         new_cov (Tensor): ``[*B, D, D]``.
 
     Returns:
-        ``KL(old || new)`` in nats, ``[*B]``.
+        ``KL(old || new)`` in nats, ``[*B]``; float32 for half types.
 
     Raises:
         ValueError: if shapes disagree.

@@ -48,7 +48,9 @@ class TrustRegionReport:
             :class:`~torchrl_safe.optim.subproblem.Subproblem`; ``"rejected"`` if there was none
             to solve.
         accepted (bool): whether the parameters moved.
-        reason (str): why they did not; empty otherwise.
+        reason (str): why they did not; empty otherwise. One of: a number or gradient is not finite;
+            the curvature is not positive definite; no step lowers a violated constraint; the best
+            step is none; or the line search is exhausted, with what it refused last.
         kl (float): divergence of the new policy, in nats; 0 if nothing moved.
         step_fraction (float): share of the subproblem's step that was taken.
         backtracks (int): candidates that the line search turned down.
@@ -151,15 +153,19 @@ class TrustRegionSafeOptimizer(torch.optim.Optimizer):
 
     * the KL is at most ``max_kl`` (and at least ``-max_kl``: an estimate below that is none), up
       to a hundredth of it, since the subproblem's step is as long as the region allows;
-    * a constraint that held still holds, and one that was violated is not violated more, up to a
-      hundredth of what one step can lower it by: along a curved boundary every step violates it a
+    * a constraint that held still holds, and one that was violated is not violated more, both up to
+      a hundredth of what one step can lower it by: along a curved boundary every step violates it a
       little, and a strict search would be stuck there for good;
     * the objective did not fall, if all constraints held.
 
-    When no candidate does, a number is not finite or the closure raises, the parameters are put
-    back bit for bit. Unless it raised, the report says why. Without constraints this is TRPO
-    (https://arxiv.org/abs/1502.05477), with them CPO (https://arxiv.org/abs/1705.10528): the
-    closure decides.
+    What the dtype of the closure's numbers cannot tell apart counts as no change. When no candidate
+    does what it must, a number is not finite or the closure raises (or is interrupted), the
+    parameters are put back bit for bit. Unless it raised, the report says why. Gradients in
+    ``.grad`` are those of before the step, whatever the closure did. Which violations are repaired
+    first, see :func:`~torchrl_safe.optim.subproblem.solve_subproblem`.
+
+    Without constraints this is TRPO (https://arxiv.org/abs/1502.05477), with them CPO
+    (https://arxiv.org/abs/1705.10528): the closure decides.
 
     **The closure** is a deterministic function of the current parameters (draw noise once, before
     the step) that returns a TensorDict without batch size, holding
@@ -196,14 +202,16 @@ class TrustRegionSafeOptimizer(torch.optim.Optimizer):
             otherwise. Backward passes through the closure's result must not make the host wait,
             as those of the blocks here do not. Defaults to ``False``.
 
-    ``max_kl``, ``damping``, ``backtrack_ratio``, ``max_backtracks``, ``cg_iters`` and
-    ``recovery_ratio`` live in ``param_groups[0]`` and may be scheduled there.
+    These numbers live in ``param_groups[0]``, may be written there at any time, also after
+    ``load_state_dict``, and are checked when a step uses them. Beside them stands ``"lr"``, a
+    factor of ``max_kl`` that starts at 1: it is what the schedulers of
+    ``torch.optim.lr_scheduler`` set. Inside ``torch.compile`` a step runs as it does outside.
 
     Raises:
         TypeError: if ``statistics_kl`` is not callable, or ``cuda_graph`` not a bool.
         ValueError: if an argument is out of its range, or the parameters are not floating point,
-            differ in dtype or device, come in several groups, or are not on a CUDA device with
-            ``cuda_graph``.
+            differ in dtype or device, come in several groups, one of them twice, or are not on a
+            CUDA device with ``cuda_graph``.
 
     Examples:
         >>> import torch

@@ -250,3 +250,79 @@ class TestMomentMatchedKL:
         torch.testing.assert_close(kl, torch.zeros_like(kl))
         for grad in grads:
             torch.testing.assert_close(grad, torch.zeros_like(grad))
+
+
+def exact_gaussian_kl(old_mean, old_cov, new_mean, new_cov):
+    """KL(old || new) of two Gaussians with fifty digits."""
+    with mpmath.workdps(50):
+        m0, m1 = (mpmath.matrix(m.double().tolist()) for m in (old_mean, new_mean))
+        c0, c1 = (mpmath.matrix(c.double().tolist()) for c in (old_cov, new_cov))
+        inverse, shift = mpmath.inverse(c1), m1 - m0
+        product = inverse * c0
+        trace = sum(product[i, i] for i in range(len(m0)))
+        determinants = mpmath.log(mpmath.det(c1) / mpmath.det(c0))
+        return float((trace - len(m0) + (shift.T * inverse * shift)[0] + determinants) / 2)
+
+
+class TestTinyDivergences:
+    """Of the size of a trust region: what a step is judged by must not be rounding."""
+
+    @pytest.mark.parametrize("size", [1.0, 1e3])
+    @pytest.mark.parametrize("kl", [1e-6, 1e-4, 1e-2])
+    @pytest.mark.parametrize("dim", [1, 2, 4])
+    def test_moment_matched(self, size, kl, dim):
+        generator = torch.Generator().manual_seed(dim)
+        for _ in range(5):
+            a = torch.randn(dim, dim, generator=generator, dtype=torch.float64)
+            mean = size * torch.randn(dim, generator=generator, dtype=torch.float64)
+            cov = size * (a @ a.T / dim + torch.eye(dim, dtype=torch.float64))
+            tilt = math.sqrt(kl) * torch.randn(dim, dim, generator=generator).double()
+            grow = torch.eye(dim, dtype=torch.float64) + tilt
+            new = (mean + math.sqrt(size) * tilt[0], grow @ cov @ grow.T)
+            given = [x.float() for x in (mean, cov, *new)]
+            exact = exact_gaussian_kl(*given)
+            assert 0 < exact < 100 * kl * dim**2
+            assert moment_matched_kl(*given).item() == pytest.approx(exact, rel=3e-3)
+            assert moment_matched_kl(*(x.double() for x in given)).item() == pytest.approx(
+                exact, rel=1e-7
+            )
+
+    @pytest.mark.parametrize("kl", [1e-6, 1e-4, 1e-2])
+    def test_matched_bound(self, kl):
+        generator = torch.Generator().manual_seed(0)
+        for _ in range(10):
+            logits = 3 * torch.randn(3, generator=generator)
+            loc = 1e3 * torch.randn(3, 2, generator=generator)
+            scale = torch.rand(3, 2, generator=generator) + 0.5
+            noise = [math.sqrt(kl) * torch.randn(x.shape, generator=generator) for x in (loc, loc)]
+            new = (logits + noise[0][:, 0], loc + noise[0], scale * noise[1].exp())
+            value = matched_bound_kl(logits, loc, scale, *new).item()
+            log_old, log_new = logits.double().log_softmax(-1), new[0].double().log_softmax(-1)
+            pairs = zip(log_old, log_new, loc, scale, *new[1:], strict=True)
+            exact = 0.0
+            for w, w_new, m, s, m_new, s_new in pairs:
+                component = exact_gaussian_kl(
+                    m, s.double().square().diag(), m_new, s_new.double().square().diag()
+                )
+                exact += w.exp().item() * ((w - w_new).item() + component)
+            assert value == pytest.approx(exact, rel=3e-3)
+
+    def test_a_weight_that_leaves_zero(self):
+        """Its ratio overflows, its share does not: KL((1, 0) || (p, 1 - p)) = -log p."""
+        loc, scale = torch.zeros(2, 1), torch.ones(2, 1)
+        old, new = torch.tensor([0.0, -400.0]), torch.tensor([0.0, 1.0])
+        value = matched_bound_kl(old, loc, scale, new, loc, scale)
+        assert value.item() == pytest.approx(math.log(1 + math.e), rel=1e-6)
+
+    @pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16])
+    def test_half_types_are_computed_in_float32(self, dtype):
+        mean, cov = torch.tensor([0.5, -0.25]), torch.tensor([[1.0, 0.25], [0.25, 0.5]])
+        given = [x.to(dtype) for x in (mean, cov, mean + 2.0**-6, 1.0078125 * cov)]
+        value = moment_matched_kl(*given)
+        assert value.dtype == torch.float32
+        assert value.item() == pytest.approx(exact_gaussian_kl(*given), rel=1e-3)
+        logits, loc, scale = torch.zeros(2), torch.zeros(2, 1), torch.ones(2, 1)
+        given = [x.to(dtype) for x in (logits, loc, scale, logits, loc + 2.0**-5, scale)]
+        value = matched_bound_kl(*given)
+        assert value.dtype == torch.float32
+        assert value.item() == pytest.approx(2.0**-11, rel=1e-5)

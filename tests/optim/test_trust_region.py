@@ -12,7 +12,7 @@ from torch import nn
 
 from torchrl_safe import TrustRegionSafeOptimizer
 from torchrl_safe.optim import TrustRegionReport
-from torchrl_safe.optim.subproblem import MAX_CONSTRAINTS
+from torchrl_safe.optim.subproblem import MAX_CONSTRAINTS, solve_subproblem
 
 
 def euclidean(old, new):
@@ -532,6 +532,187 @@ def test_report_to_dict(m):
     if m:
         assert numbers[f"update/constraint_change{suffixes[-1]}"] == report.constraint_change[-1]
     assert set(report.to_dict(prefix="")) == scalars | vectors
+
+
+# -- linear problems: the whole step, to the optimum
+
+
+def linear(rng, m, dtype, kind, n=12):
+    """Factors of a metric, gradients and values of a random linear problem, and its size."""
+    a = rng.normal(size=(n, n))
+    h = a @ a.T / n + 0.1 * np.eye(n)
+    g, b = rng.normal(size=n), rng.normal(size=(m, n))
+    if kind == "parallel":
+        b[1::2] = b[: len(b[1::2])] * rng.choice([-1, 1])
+    elif kind == "flat":
+        b[0] = 0.0
+    g *= 10.0 ** rng.uniform(-3, 3)
+    b *= 10.0 ** rng.uniform(-3, 3, size=(m, 1))
+    max_kl = 10.0 ** rng.uniform(-4, -1)
+    reach = np.sqrt(2 * max_kl * np.einsum("ij,jk,ik->i", b, np.linalg.inv(h), b))
+    low, high = {"feasible": (-1, 0), "far": (1e3, 1e6), "flat": (0.1, 2)}.get(kind, (-0.3, 2.5))
+    c = rng.uniform(low, high, size=m) * np.where(reach > 0, reach, 1.0)
+    return *(torch.tensor(x, dtype=dtype) for x in (h, g, b, c)), max_kl
+
+
+@pytest.mark.parametrize("kind", ["feasible", "infeasible", "parallel", "flat", "far"])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_every_linear_problem_takes_its_whole_step(kind, dtype):
+    rng = np.random.default_rng(0)
+    for m in (1, 2, 3, 5, 8, 10):
+        for _ in range(3):
+            h, g, b, c, max_kl = linear(rng, m, dtype, kind)
+            x = nn.Parameter(torch.zeros(len(g), dtype=dtype))
+            optim = optimizer(
+                x,
+                max_kl=max_kl,
+                cg_iters=30,
+                statistics_kl=lambda o, w, h=h: 0.5 * (w - o) @ h @ (w - o),
+            )
+            report = optim.step(Recorder(x, lambda x, g=g: g @ x, lambda x, b=b, c=c: c + b @ x))
+            if kind == "flat" and m == 1:
+                assert report.reason == "no step lowers a violated constraint"
+                continue
+            if kind == "parallel" and not report.accepted:
+                assert report.reason == "no step lowers a violated constraint"
+                continue
+            assert report.accepted, (m, report.reason)
+            assert report.step_fraction == 1.0
+            # The step is the subproblem's solution from the exact Gram matrix.
+            exact = [v.double().numpy() for v in (h, g, b, c)]
+            inverse = np.linalg.inv(exact[0])
+            solution = solve_subproblem(
+                exact[1] @ inverse @ exact[1],
+                exact[2] @ inverse @ exact[1],
+                exact[2] @ inverse @ exact[2].T,
+                exact[3],
+                max_kl,
+            )
+            if kind == "parallel":  # whose weights are not unique to the last digits
+                continue
+            weighted = solution.objective_weight * exact[1]
+            step = inverse @ (weighted - solution.constraint_weight @ exact[2])
+            error = x.detach().double().numpy() - step
+            assert math.sqrt(error @ exact[0] @ error / (2 * max_kl)) < 5e-3
+            assert report.case == solution.case
+
+
+@pytest.mark.parametrize(("growth", "accepted"), [(0.5, True), (1.5, False)])
+def test_a_violated_constraint_has_the_slack_of_one_that_holds(growth, accepted):
+    """A hundredth of what one step can lower it by, ``|b| sqrt(2 max_kl)``."""
+    reach = math.sqrt(2 * 0.02)
+
+    def constraint(x):  # the second one can only be held, because of the third, and bends upwards
+        bend = 0.01 * growth * reach * (x[2] / reach).square() / 0.99
+        return torch.stack([0.1 * reach + x[0], 0.5 * reach + x[1] + bend, -x[1]])
+
+    x = parameter(0.0, 0.0, 0.0)
+    report = optimizer(x, max_backtracks=0).step(Recorder(x, lambda x: x[2], constraint))
+    assert report.case == "infeasible"
+    assert report.accepted is accepted
+    if accepted:
+        expected = torch.tensor([-0.1, 0.0, math.sqrt(0.99)], dtype=torch.float64) * reach
+        torch.testing.assert_close(x.detach(), expected, atol=1e-5 * reach, rtol=0)
+
+
+# -- what a failed update leaves
+
+
+class Failure(Exception):
+    pass
+
+
+@pytest.mark.parametrize("error", [Failure, KeyboardInterrupt])
+@pytest.mark.parametrize("at", [1, 2])
+def test_a_closure_that_fails_after_a_backward_pass_leaves_gradients_and_state(error, at):
+    x, y = parameter(*AWKWARD[:2]), parameter(1.0)
+    x.grad = torch.full_like(x, 7.0)
+    kept, optim, calls = x.grad, optimizer([x, y]), []
+    before, state = bits(x), copy.deepcopy(optim.state_dict())
+
+    def closure():
+        calls.append(0)
+        with torch.enable_grad():
+            (x.sum() + y.sum()).backward()
+        if len(calls) == at:
+            raise error
+        return TensorDict({"objective": x.sum(), "statistics": x * 1.0})
+
+    with pytest.raises(error):
+        optim.step(closure)
+    assert bits(x) == before
+    assert x.grad is kept
+    assert kept.tolist() == [7.0, 7.0]
+    assert y.grad is None
+    assert optim.state_dict() == state
+
+
+@pytest.mark.parametrize("give", [list, tuple, iter])
+def test_a_parameter_given_twice(give):
+    x = parameter(0.0)
+    with pytest.raises(ValueError, match="params must hold every parameter once"):
+        optimizer(give([x, x]))
+    with pytest.raises(ValueError, match="at least one parameter, got none"):
+        optimizer([{"params": []}])
+
+
+# -- schedules, checkpoints, compilation
+
+
+def test_schedulers_of_torch_scale_the_region():
+    x = parameter(0.0)
+    optim = optimizer(x, max_kl=0.02)
+    scheduler = torch.optim.lr_scheduler.LambdaLR(optim, lambda n: 0.25**n)
+    for size in (0.02, 0.005, 0.00125):
+        report = optim.step(Recorder(x, lambda x: x.sum()))
+        assert report.objective_change == pytest.approx(math.sqrt(2 * size))
+        scheduler.step()
+    assert optim.param_groups[0]["max_kl"] == 0.02
+
+
+@pytest.mark.parametrize("lr", [0.0, -1.0, math.nan, math.inf, None])
+def test_a_schedule_out_of_range_moves_nothing(lr):
+    x = parameter(0.0)
+    optim = optimizer(x)
+    optim.param_groups[0]["lr"] = lr
+    with pytest.raises(ValueError, match=f"lr must be a positive finite number, got {lr}"):
+        optim.step(Recorder(x, lambda x: x.sum()))
+    assert x.item() == 0.0
+
+
+def test_settings_written_after_loading_a_checkpoint_are_those_of_the_next_step():
+    x = parameter(0.0)
+    saved = optimizer(x, max_kl=0.07).state_dict()
+    del saved["param_groups"][0]["lr"]  # as in a checkpoint from before there was one
+    optim = optimizer(x, max_kl=0.3)
+    optim.load_state_dict(saved)
+    for max_kl in (0.07, 0.005):
+        optim.param_groups[0]["max_kl"] = max_kl
+        report = optim.step(Recorder(x, lambda x: x.sum()))
+        assert report.objective_change == pytest.approx(math.sqrt(2 * max_kl))
+    optim.param_groups[0]["max_kl"] = math.nan
+    with pytest.raises(ValueError, match="max_kl must be a positive finite number, got nan"):
+        optim.step(Recorder(x, lambda x: x.sum()))
+
+
+def test_a_compiled_step_is_the_eager_one():
+    ends = []
+    for wrap in (lambda f: f, lambda f: torch.compile(f, backend="eager")):
+        torch.manual_seed(1)
+        net, data = nn.Linear(3, 2), torch.randn(16, 3)
+        optim = TrustRegionSafeOptimizer(net.parameters(), max_kl=1e-2)
+        old = net(data).detach()
+
+        def closure(net=net, data=data, old=old):
+            y = net(data)
+            kl = 0.5 * (y - old).square().sum(-1).mean()
+            return TensorDict({"objective": y.mean(), "kl": kl})
+
+        report = wrap(optim.step)(closure)
+        assert report.accepted
+        ends.append((report, net.weight.detach().clone()))
+    assert ends[0][0] == ends[1][0]
+    assert torch.equal(ends[0][1], ends[1][1])
 
 
 # -- misuse

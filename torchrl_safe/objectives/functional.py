@@ -255,7 +255,7 @@ def matched_bound_kl(
         new_scale (Tensor): ``[*B, K, D]``.
 
     Returns:
-        The bound on ``KL(old || new)`` in nats, ``[*B]``.
+        The bound on ``KL(old || new)`` in nats, ``[*B]``; float32 for half types.
 
     Raises:
         ValueError: if shapes disagree.
@@ -278,12 +278,18 @@ def matched_bound_kl(
         ("new_scale", new_scale, shape),
         because=f"old_loc's {shape}",
     )
-    ratio = old_scale / new_scale
+    old_logits, old_loc, old_scale, new_logits, new_loc, new_scale = _at_least_float32(
+        old_logits, old_loc, old_scale, new_logits, new_loc, new_scale
+    )
+    # Written in what changes, which is small for a small KL, so that nothing cancels.
+    change = (old_scale - new_scale) / new_scale
     shift = (new_loc - old_loc) / new_scale
-    component = 0.5 * (ratio.square() - 1 + shift.square()).sum(-1) - ratio.log().sum(-1)
-    log_weight = old_logits.log_softmax(-1)
-    gap = log_weight - new_logits.log_softmax(-1)
-    return (log_weight.exp() * (gap + component)).sum(-1)
+    component = 0.5 * (change.square() + shift.square()) + change - change.log1p()
+    log_weight, new_log_weight = old_logits.log_softmax(-1), new_logits.log_softmax(-1)
+    weight, gap = log_weight.exp(), new_log_weight - log_weight
+    # w' - w, which sums to zero; the first form cancels where they are close, the second overflows.
+    tilt = torch.where(gap > 1, new_log_weight.exp() - weight, weight * gap.clamp(max=1).expm1())
+    return (tilt + weight * (component.sum(-1) - gap)).sum(-1)
 
 
 def moment_matched_kl(
@@ -301,7 +307,7 @@ def moment_matched_kl(
         new_cov (Tensor): ``[*B, D, D]``.
 
     Returns:
-        ``KL(old || new)`` in nats, ``[*B]``.
+        ``KL(old || new)`` in nats, ``[*B]``; float32 for half types.
 
     Raises:
         ValueError: if shapes disagree.
@@ -321,14 +327,23 @@ def moment_matched_kl(
         ("new_cov", new_cov, cov_shape),
         because=f"old_mean's {mean_shape}",
     )
+    old_mean, old_cov, new_mean, new_cov = _at_least_float32(old_mean, old_cov, new_mean, new_cov)
     new_factor, old_factor = _cholesky(new_cov), _cholesky(old_cov)
     dim = range(old_mean.shape[-1])
     zero = torch.zeros_like(old_mean[..., 0])
-    columns = [[old_factor[i][j] if j <= i else zero for i in dim] for j in dim]
+    # With E = L'^-1 (L - L'), which is small for a small KL, nothing cancels in
+    # KL = (|E|^2 + |L'^-1 (m' - m)|^2) / 2 + sum_i E_ii - log(1 + E_ii).
+    columns = [[old_factor[i][j] - new_factor[i][j] if j <= i else zero for i in dim] for j in dim]
     shift = list((new_mean - old_mean).unbind(-1))
-    squares = [x.square() for b in (*columns, shift) for x in _solve_lower(new_factor, b)]
-    half_log_dets = [(new_factor[i][i] / old_factor[i][i]).log() for i in dim]
-    return torch.stack(squares).sum(0).sub(len(dim)).mul(0.5) + torch.stack(half_log_dets).sum(0)
+    solved = [_solve_lower(new_factor, b) for b in (*columns, shift)]
+    squares = torch.stack([x.square() for column in solved for x in column]).sum(0)
+    diagonal = torch.stack([solved[i][i] for i in dim])
+    return 0.5 * squares + (diagonal - diagonal.log1p()).sum(0)
+
+
+def _at_least_float32(*tensors: Tensor) -> tuple[Tensor, ...]:
+    """Half types, which autocast makes, tell apart no KL of the size of a trust region."""
+    return tuple(x.float() if torch.finfo(x.dtype).bits < 32 else x for x in tensors)
 
 
 def _check_shapes(*expected: tuple[str, Tensor, tuple[int, ...]], because: str) -> None:

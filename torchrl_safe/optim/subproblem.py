@@ -19,9 +19,10 @@ from numpy.typing import ArrayLike, NDArray
 MAX_CONSTRAINTS = 10
 """The active sets are enumerated, all ``2**m`` of them at once."""
 
-_FEASIBILITY = 1e-9  # of a constraint, in radii of the trust region
-_DEPENDENT = 1e-12  # squared sine below which two gradients count as parallel
-_BISECTIONS = 60
+_FEASIBILITY = 5e-7  # of a constraint, in radii of the trust region
+# Squared sine below which two gradients count as parallel: taken for one, they miss by the sine.
+_DEPENDENT = 1e-14
+_INDEFINITE = 1e-6  # least eigenvalue of unit vectors' products, below zero, that is no rounding
 
 Array = NDArray[np.float64]
 
@@ -33,8 +34,8 @@ class Subproblem:
     Attributes:
         case (str): ``"unconstrained"`` (no constraint), ``"inert"`` (none can become active inside
             the region), ``"feasible"`` (all hold now), ``"recoverable"`` (a violated one is
-            repaired inside the region), ``"infeasible"`` (the violation is only reduced) or
-            ``"rejected"`` (no step, see ``reason``).
+            repaired inside the region), ``"infeasible"`` (some violation stays) or ``"rejected"``
+            (no step, see ``reason``).
         objective_weight (float): weight of ``H^-1 g``.
         constraint_weight (numpy.ndarray): weights of the ``H^-1 b_i``, shape [m].
         reason (str): why there is no step; empty otherwise.
@@ -62,12 +63,19 @@ def solve_subproblem(
     point is known in closed form, and the best feasible one over all sets is the optimum. With one
     constraint the two sets are the two branches of the closed form in the literature.
 
-    A violation that cannot be removed is shared out as follows. The largest scaled violation
-    ``t = max_i (d_i + v_i'y)``, over the violated constraints, is made as small as a step of
-    length ``recovery_ratio`` (in radii) can make it, while satisfied constraints keep holding and
-    no violated one grows; the rest of the region then serves the objective, with that reduction
-    kept. With one constraint this caps the violation at ``recovery_ratio * sqrt(2 max_kl s)``, and
-    ``recovery_ratio=1`` is the pure recovery step ``-sqrt(2 max_kl / s) H^-1 b``.
+    Violations that cannot all be removed by a step of length ``recovery_ratio`` (in radii) are
+    lowered in this order, while satisfied constraints keep holding and no violated one grows:
+
+    1. Those are removed that can be, the one with the smallest ``d_i`` first: each is added if it
+       can be removed together with those before it.
+    2. The sum of the others' ``d_i + v_i'y`` is made as small as possible.
+    3. The rest of the region serves the objective, with all these reductions kept.
+
+    One that cannot be lowered, as its gradient is zero or opposed to that of another, thus leaves
+    the region to the others. With one constraint the violation falls by
+    ``recovery_ratio * sqrt(2 max_kl s)``, and ``recovery_ratio=1`` is the pure recovery step
+    ``-sqrt(2 max_kl / s) H^-1 b``. If no violation can be lowered there is no step: the objective
+    alone is not followed from where a constraint is violated.
 
     Args:
         q (float): ``g' H^-1 g``.
@@ -102,35 +110,31 @@ def solve_subproblem(
     variance = np.diag(s)
     if not all(np.isfinite(value).all() for value in (q, r, s, c, max_kl)):
         return Subproblem("rejected", 0.0, weight, "non-finite products of the gradients")
-    if q < 0 or (variance < 0).any():
+    unit = np.sqrt(np.clip([q, *variance], 0, None))
+    unit[unit == 0] = 1.0
+    gram = np.block([[np.full((1, 1), q), r[None]], [r[:, None], s]]) / np.outer(unit, unit)
+    if q < 0 or (variance < 0).any() or np.linalg.eigvalsh(gram)[0] < -_INDEFINITE:
         return Subproblem("rejected", 0.0, weight, "the curvature is not positive definite")
-    if ((variance == 0) & (c > 0)).any():
-        return Subproblem("rejected", 0.0, weight, "a violated constraint has no gradient")
-
     length = np.sqrt(2 * max_kl)
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         distance = c / (length * np.sqrt(variance))
     # A satisfied constraint whose boundary lies outside the region cannot become active.
     kept = np.flatnonzero((variance > 0) & (distance >= -1))
-    objective_scale = length / np.sqrt(q) if q > 0 else 0.0
-    if not kept.size:
+    objective_scale = length / unit[0] if q > 0 else 0.0
+    flat = bool(((variance == 0) & (c > 0)).any())
+    if not (kept.size or flat):
         return Subproblem("inert" if m else "unconstrained", objective_scale, weight)
-    scale = np.sqrt(variance[kept])
-    cosine = r[kept] / (np.sqrt(q) * scale) if q > 0 else np.zeros(kept.size)
-    faces = _Faces(float(q > 0), cosine, s[np.ix_(kept, kept)] / np.outer(scale, scale))
-
+    faces = _Faces(gram[1:, 1:][np.ix_(kept, kept)])
     distance = distance[kept]
     case = "feasible"
-    if distance.max() > _FEASIBILITY:
-        cut = _reachable_reduction(faces, distance, recovery_ratio)
-        if cut <= _FEASIBILITY:
-            return Subproblem("rejected", 0.0, weight, "no direction lowers the largest violation")
-        case = "recoverable" if cut == distance.max() else "infeasible"
-        distance = _relax(distance, cut)
-    best = faces.best(distance)
-    if best is None:
-        return Subproblem("rejected", 0.0, weight, "the curvature is not positive definite")
-    along_objective, along_constraint = best
+    if flat or (distance > _FEASIBILITY).any():
+        target, repaired = _recover(faces, distance, recovery_ratio)
+        if not (target[distance > 0] > _FEASIBILITY).any():
+            return Subproblem("rejected", 0.0, weight, "no step lowers a violated constraint")
+        case = "recoverable" if repaired and not flat else "infeasible"
+        distance = target
+    along_objective, along_constraint = faces.best(distance, gram[0, 0], gram[0, 1:][kept])
+    scale = unit[1:][kept]
     weight[kept] = along_constraint * length / scale
     return Subproblem(case, along_objective * objective_scale, weight)
 
@@ -139,72 +143,107 @@ class _Faces:
     """The faces of the polyhedron ``v_i'y <= -d_i`` under a fixed set of unit vectors.
 
     Args:
-        unit (float): squared length of ``v_0``: one, or zero when there is no objective.
-        cosine (numpy.ndarray): ``v_i'v_0``, shape [m].
         gram (numpy.ndarray): ``v_i'v_j``, shape [m, m].
     """
 
-    def __init__(self, unit: float, cosine: Array, gram: Array) -> None:
-        m = cosine.size
+    def __init__(self, gram: Array) -> None:
+        m = len(gram)
         active = (np.arange(2**m)[:, None] >> np.arange(m)) & 1
         active = active[np.argsort(active.sum(1), kind="stable")].astype(bool)
         both = active[:, :, None] & active[:, None, :]
         restricted = np.where(both, gram, np.eye(m))
         # Linearly dependent gradients add nothing: an independent subset has the same face.
-        independent = np.linalg.eigvalsh(restricted)[:, 0] > _DEPENDENT
-        both, restricted = both[independent], restricted[independent]
-        self.cosine, self.gram = cosine, gram
-        self.inverse = np.where(both, np.linalg.inv(restricted), 0.0)  # [sets, m, m]
-        self.slope = self.inverse @ cosine  # [sets, m]
-        free = unit - self.slope @ cosine
-        # What is left of the objective along each face, none where it is normal to the face.
-        self.free = np.where(free > _DEPENDENT, free, 0.0)
+        values, vectors = np.linalg.eigh(restricted)
+        independent = (values > _DEPENDENT).all(-1)
+        self.gram = gram
+        self.active = active[independent]
+        # Not multiplied out: what rounding does then stays along the gradients that nearly cancel.
+        self.values, self.vectors = values[independent], vectors[independent]
 
-    def _nearest(self, distance: Array) -> tuple[Array, Array]:
-        """Weights of the point of each face nearest to the origin, [sets, m], and its norm^2."""
-        weight = self.inverse @ distance
-        return weight, weight @ distance
+    def _solve(self, rhs: Array) -> Array:
+        """Weights ``G_A^-1 rhs_A`` of each face's constraints A, zero elsewhere, [sets, m]."""
+        rhs = np.where(self.active, rhs, 0.0)[:, None, :] @ self.vectors / self.values[:, None, :]
+        return np.where(self.active, (self.vectors @ rhs.swapaxes(1, 2))[..., 0], 0.0)
+
+    def _nearest(self, distance: Array, radius: float) -> tuple[Array, Array, NDArray[np.bool_]]:
+        """Weights of the point of each face nearest to the origin, [sets, m], and its norm^2.
+
+        And whether that is within the radius.
+        """
+        weight = self._solve(distance)
+        norm = weight @ distance
+        return weight, norm, (norm >= -_FEASIBILITY) & (norm <= radius**2 * (1 + _FEASIBILITY))
 
     def _feasible(self, values: Array, distance: Array) -> NDArray[np.bool_]:
         return np.asarray((values + distance <= _FEASIBILITY).all(-1))
 
     def reaches(self, distance: Array, radius: float) -> bool:
         """Whether some point within ``radius`` of the origin satisfies all constraints."""
-        weight, norm = self._nearest(distance)
-        near = (norm >= -_FEASIBILITY) & (norm <= radius**2 * (1 + _FEASIBILITY))
+        weight, _, near = self._nearest(distance, radius)
         return bool((near & self._feasible(-weight @ self.gram, distance)).any())
 
-    def best(self, distance: Array) -> tuple[float, Array] | None:
-        """The optimum ``y = a v_0 - sum_i w_i v_i`` in the unit ball, as ``a`` and ``w`` [m]."""
-        nearest, norm = self._nearest(distance)
-        room = np.sqrt(np.clip(1 - norm, 0, None))
-        a = np.divide(room, np.sqrt(self.free), out=np.zeros_like(room), where=self.free > 0)
-        weight = nearest + a[:, None] * self.slope
-        values = a[:, None] * self.cosine - weight @ self.gram
-        valid = (norm >= -_FEASIBILITY) & (norm <= 1 + _FEASIBILITY)
-        valid &= self._feasible(values, distance)
-        if not valid.any():
-            return None
-        # v_0'y; the part along the face is a * free, without cancellation.
-        objective = np.where(valid, a * self.free - nearest @ self.cosine, -np.inf)
+    def best(
+        self, distance: Array, unit: float, cosine: Array, radius: float = 1.0
+    ) -> tuple[float, Array]:
+        """The optimum ``y = a u - sum_i w_i v_i`` of ``u'y`` in a ball that the polyhedron reaches.
+
+        Args:
+            distance (numpy.ndarray): ``d_i``, shape [m].
+            unit (float): squared length of ``u``: one, or zero when there is no objective.
+            cosine (numpy.ndarray): ``v_i'u``, shape [m].
+            radius (float): of the ball.
+
+        Returns:
+            tuple: ``a`` and ``w``, shape [m].
+        """
+        nearest, norm, near = self._nearest(distance, radius)
+        slope = self._solve(cosine)
+        free = unit - slope @ cosine
+        # What is left of the objective along each face, none where it is normal to the face.
+        free = np.where(free > _DEPENDENT, free, 0.0)
+        room = np.sqrt(np.clip(radius**2 - norm, 0, None))
+        along = np.divide(room, np.sqrt(free), out=np.zeros_like(room), where=free > 0)
+        # Where a face only touches the ball, rounding may leave no more than its nearest point.
+        a = np.concatenate([along, np.zeros_like(along)])
+        nearest, slope, free, near = (np.concatenate([x, x]) for x in (nearest, slope, free, near))
+        weight = nearest + a[:, None] * slope
+        valid = near & self._feasible(a[:, None] * cosine - weight @ self.gram, distance)
+        # u'y; the part along the face is a * free, without cancellation.
+        objective = np.where(valid, a * free - nearest @ cosine, -np.inf)
         index = int(objective.argmax())
         return float(a[index]), weight[index]
 
 
-def _relax(distance: Array, cut: float) -> Array:
-    """Distances to go when the largest violation falls by ``cut`` and no other one grows."""
-    return np.where(distance > 0, np.clip(distance - distance.max() + cut, 0, None), distance)
+def _recover(faces: _Faces, distance: Array, radius: float) -> tuple[Array, bool]:
+    """Distances to go when violations fall as :func:`solve_subproblem` says.
 
+    Args:
+        faces (_Faces): of the constraints.
+        distance (numpy.ndarray): ``d_i``, shape [m].
+        radius (float): of the region that recovery may use.
 
-def _reachable_reduction(faces: _Faces, distance: Array, radius: float) -> float:
-    """The largest fall of the largest violation within ``radius``, both in radii of the region."""
-    low, high = 0.0, min(radius, float(distance.max()))
-    if faces.reaches(_relax(distance, high), radius):
-        return high
-    for _ in range(_BISECTIONS):
-        middle = (low + high) / 2
-        if faces.reaches(_relax(distance, middle), radius):
-            low = middle
-        else:
-            high = middle
-    return low
+    Returns:
+        tuple: the distances, shape [m], and whether nothing is violated after them.
+    """
+    violated = distance > 0
+    left, target = violated.copy(), np.where(violated, 0.0, distance)
+    if faces.reaches(distance, radius):
+        return distance, True
+    for i in np.flatnonzero(violated)[np.argsort(distance[violated], kind="stable")]:
+        more = target.copy()
+        more[i] = distance[i]
+        if faces.reaches(more, radius):
+            left[i], target = False, more
+    # What is left, lowered together: none of it could be removed, so there is none to stop at.
+    down = -faces.gram @ left
+    length = np.sqrt(max(-down @ left, 0.0))
+    aligned = length > np.sqrt(_DEPENDENT)
+    cosine = down / length if aligned else np.zeros_like(down)
+    a, weight = faces.best(target, float(aligned), cosine, radius)
+    fall = np.where(left, weight @ faces.gram - a * cosine, 0.0)
+    # As found, or by as much less as rounding asks for: at the last slack nothing more has to fall.
+    for slack in (0.0, *10.0 ** np.arange(-12, 1)):
+        lowered = np.where(left, np.clip(fall - slack, 0, distance), target)
+        if faces.reaches(lowered, radius):
+            break
+    return lowered, False

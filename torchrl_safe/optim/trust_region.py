@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Callable, Iterable
 from contextlib import nullcontext
 from dataclasses import dataclass
@@ -47,7 +48,9 @@ class TrustRegionReport:
             :class:`~torchrl_safe.optim.subproblem.Subproblem`; ``"rejected"`` if there was none
             to solve.
         accepted (bool): whether the parameters moved.
-        reason (str): why they did not; empty otherwise.
+        reason (str): why they did not; empty otherwise. One of: a number or gradient is not finite;
+            the curvature is not positive definite; no step lowers a violated constraint; the best
+            step is none; or the line search is exhausted, with what it refused last.
         kl (float): divergence of the new policy, in nats; 0 if nothing moved.
         step_fraction (float): share of the subproblem's step that was taken.
         backtracks (int): candidates that the line search turned down.
@@ -100,6 +103,7 @@ class TrustRegionReport:
 
 # Of the line search: a share of max_kl, and of the most that one step can lower a constraint by.
 _TOLERANCE = 0.01
+_ROUNDING = 8  # of a closure's numbers, in units of their resolution
 
 
 class _Rejected(Exception):
@@ -113,6 +117,7 @@ class _Evaluation:
     objective: float
     constraint: NDArray[np.float64]
     kl: float
+    eps: float  # resolution of the least precise of objective and constraints
 
     def is_finite(self) -> bool:
         return bool(np.isfinite([self.objective, self.kl, *self.constraint]).all())
@@ -128,7 +133,7 @@ class _Proposal(NamedTuple):
     case: str
     direction: Tensor  # [n]
     predicted: list[float]  # changes of the objective and the constraints, [1 + m]
-    tolerance: NDArray[np.float64]  # excess of a constraint that is let pass, [m]
+    reach: NDArray[np.float64]  # the most one step can change objective and constraints, [1 + m]
     cg_residual: float
 
 
@@ -148,15 +153,19 @@ class TrustRegionSafeOptimizer(torch.optim.Optimizer):
 
     * the KL is at most ``max_kl`` (and at least ``-max_kl``: an estimate below that is none), up
       to a hundredth of it, since the subproblem's step is as long as the region allows;
-    * a constraint that held still holds, and one that was violated is not violated more, up to a
-      hundredth of what one step can lower it by: along a curved boundary every step violates it a
+    * a constraint that held still holds, and one that was violated is not violated more, both up to
+      a hundredth of what one step can lower it by: along a curved boundary every step violates it a
       little, and a strict search would be stuck there for good;
     * the objective did not fall, if all constraints held.
 
-    When no candidate does, a number is not finite or the closure raises, the parameters are put
-    back bit for bit. Unless it raised, the report says why. Without constraints this is TRPO
-    (https://arxiv.org/abs/1502.05477), with them CPO (https://arxiv.org/abs/1705.10528): the
-    closure decides.
+    What the dtype of the closure's numbers cannot tell apart counts as no change. When no candidate
+    does what it must, a number is not finite or the closure raises (or is interrupted), the
+    parameters are put back bit for bit. Unless it raised, the report says why. Gradients in
+    ``.grad`` are those of before the step, whatever the closure did. Which violations are repaired
+    first, see :func:`~torchrl_safe.optim.subproblem.solve_subproblem`.
+
+    Without constraints this is TRPO (https://arxiv.org/abs/1502.05477), with them CPO
+    (https://arxiv.org/abs/1705.10528): the closure decides.
 
     **The closure** is a deterministic function of the current parameters (draw noise once, before
     the step) that returns a TensorDict without batch size, holding
@@ -193,14 +202,16 @@ class TrustRegionSafeOptimizer(torch.optim.Optimizer):
             otherwise. Backward passes through the closure's result must not make the host wait,
             as those of the blocks here do not. Defaults to ``False``.
 
-    ``max_kl``, ``damping``, ``backtrack_ratio``, ``max_backtracks``, ``cg_iters`` and
-    ``recovery_ratio`` live in ``param_groups[0]`` and may be scheduled there.
+    These numbers live in ``param_groups[0]``, may be written there at any time, also after
+    ``load_state_dict``, and are checked when a step uses them. Beside them stands ``"lr"``, a
+    factor of ``max_kl`` that starts at 1: it is what the schedulers of
+    ``torch.optim.lr_scheduler`` set. Inside ``torch.compile`` a step runs as it does outside.
 
     Raises:
         TypeError: if ``statistics_kl`` is not callable, or ``cuda_graph`` not a bool.
         ValueError: if an argument is out of its range, or the parameters are not floating point,
-            differ in dtype or device, come in several groups, or are not on a CUDA device with
-            ``cuda_graph``.
+            differ in dtype or device, come in several groups, one of them twice, or are not on a
+            CUDA device with ``cuda_graph``.
 
     Examples:
         >>> import torch
@@ -242,6 +253,7 @@ class TrustRegionSafeOptimizer(torch.optim.Optimizer):
         self.statistics_kl = statistics_kl
         self.cuda_graph = cuda_graph
         defaults = {
+            "lr": 1.0,
             "max_kl": max_kl,
             "damping": damping,
             "cg_iters": cg_iters,
@@ -251,6 +263,11 @@ class TrustRegionSafeOptimizer(torch.optim.Optimizer):
         }
         _check_settings(defaults)
         super().__init__(params, defaults)
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        super().__setstate__(state)
+        for group in self.param_groups:  # of a checkpoint from before there was a schedule
+            group.setdefault("lr", 1.0)
 
     def __getstate__(self) -> dict[str, Any]:
         kept = {"statistics_kl": self.statistics_kl, "cuda_graph": self.cuda_graph}
@@ -265,9 +282,13 @@ class TrustRegionSafeOptimizer(torch.optim.Optimizer):
         if self.param_groups:
             raise ValueError("params must be one group, got several: a trust region has one size.")
         _check_settings({**self.defaults, **param_group})
-        super().add_param_group(param_group)
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", message=".*duplicate parameters")
+            super().add_param_group(param_group)  # which only warns of them
         self._check_params(self.param_groups[0]["params"])
 
+    # Solving the subproblem is no work for a compiler, nor is a graph that is differentiated twice.
+    @torch.compiler.disable
     def step(self, closure: Closure) -> TrustRegionReport:  # type: ignore[override]
         """Take one step.
 
@@ -294,12 +315,18 @@ class TrustRegionSafeOptimizer(torch.optim.Optimizer):
             raise ValueError("params must hold one that requires a gradient, got none that does.")
         self._check_params(params)
         backup = [p.detach().clone() for p in params]
+        grads = [p.grad for p in params]
+        for p in params:  # aside, so that a closure with a backward pass adds to none of them
+            p.grad = None
         try:
             with self._graphs.stream() if self.cuda_graph else nullcontext():
                 report = self._step(closure, params, backup, settings)
         except BaseException:
             _move(params, backup)
             raise
+        finally:
+            for p, grad in zip(params, grads, strict=True):
+                p.grad = grad
         if not report.accepted:
             _move(params, backup)
         return report
@@ -311,21 +338,22 @@ class TrustRegionSafeOptimizer(torch.optim.Optimizer):
         backup: list[Tensor],
         settings: dict[str, Any],
     ) -> TrustRegionReport:
+        max_kl = settings["lr"] * settings["max_kl"]
         with torch.enable_grad():
             out = self._call(closure)
             old = None if self.statistics_kl is None else detach(out.get("statistics"))
             before = self._evaluate(out, old)
-            if abs(before.kl) > settings["max_kl"]:
+            if abs(before.kl) > max_kl:
                 raise ValueError(
                     "'kl' must be zero at the parameters the step starts from, got "
-                    f"{before.kl} with max_kl={settings['max_kl']}."
+                    f"{before.kl} with max_kl={max_kl}."
                 )
             report: dict[str, Any] = {
                 "objective": before.objective,
                 "constraint": tuple(before.constraint.tolist()),
             }
             try:
-                proposal = self._propose(out, before, params, settings)
+                proposal = self._propose(out, before, params, settings, max_kl)
             except _Rejected as rejection:
                 return TrustRegionReport("rejected", False, str(rejection), **report)
         report.update(case=proposal.case, cg_residual=proposal.cg_residual)
@@ -338,7 +366,7 @@ class TrustRegionSafeOptimizer(torch.optim.Optimizer):
             with torch.no_grad():
                 _move(params, torch._foreach_add(backup, moves, alpha=fraction))
                 after = self._evaluate(self._call(closure), old)
-            reason = _refusal(before, after, settings["max_kl"], proposal.tolerance)
+            reason = _refusal(before, after, max_kl, proposal.reach)
             if not reason:
                 return TrustRegionReport(
                     accepted=True,
@@ -364,6 +392,7 @@ class TrustRegionSafeOptimizer(torch.optim.Optimizer):
         before: _Evaluation,
         params: list[Tensor],
         settings: dict[str, Any],
+        max_kl: float,
     ) -> _Proposal:
         """Linearises, finds the natural gradients and solves the subproblem."""
         if not before.is_finite():
@@ -399,7 +428,7 @@ class TrustRegionSafeOptimizer(torch.optim.Optimizer):
             gram[1:, 0],
             gram[1:, 1:],
             before.constraint,
-            settings["max_kl"],
+            max_kl,
             settings["recovery_ratio"],
         )
         if solution.reason:
@@ -412,11 +441,15 @@ class TrustRegionSafeOptimizer(torch.optim.Optimizer):
             case=solution.case,
             direction=(weights @ solved).to(gradients.dtype),
             predicted=(gram @ dual).tolist(),
-            tolerance=_TOLERANCE * np.sqrt(2 * settings["max_kl"] * np.diag(gram)[1:]),
+            reach=np.sqrt(2 * max_kl * np.diag(gram).clip(0)),
             cg_residual=residual,
         )
 
     def _check_params(self, params: list[Tensor]) -> None:
+        if not params:
+            raise ValueError("params must hold at least one parameter, got none.")
+        if len({id(p) for p in params}) < len(params):
+            raise ValueError("params must hold every parameter once, got one of them twice.")
         kinds = {(p.dtype, p.device) for p in params}
         if len(kinds) != 1 or not params[0].is_floating_point():
             raise ValueError(
@@ -463,11 +496,13 @@ class TrustRegionSafeOptimizer(torch.optim.Optimizer):
                     raise ValueError(
                         f"statistics_kl must return a scalar, got shape {tuple(kl.shape)}."
                     )
-            values = [out.get("objective").reshape(1), kl.reshape(1)]
+            compared = [out.get("objective").reshape(1)]
             if out.get("constraint", None) is not None:
-                values.append(out.get("constraint"))
-            numbers = torch.cat([value.double() for value in values]).cpu().numpy()
-        return _Evaluation(float(numbers[0]), numbers[2:], float(numbers[1]))
+                compared.append(out.get("constraint"))
+            values = torch.cat([value.double() for value in (kl.reshape(1), *compared)])
+            numbers = values.cpu().numpy()
+        eps = max(torch.finfo(value.dtype).eps for value in compared)
+        return _Evaluation(float(numbers[1]), numbers[2:], float(numbers[0]), eps)
 
 
 def _gradients(out: TensorDictBase, params: list[Tensor]) -> Tensor:
@@ -505,7 +540,7 @@ def _galerkin(
 
 
 def _refusal(
-    before: _Evaluation, after: _Evaluation, max_kl: float, tolerance: NDArray[np.float64]
+    before: _Evaluation, after: _Evaluation, max_kl: float, reach: NDArray[np.float64]
 ) -> str:
     """Why the line search turns a candidate down; empty if it does not."""
     if after.constraint.shape != before.constraint.shape:
@@ -517,11 +552,15 @@ def _refusal(
         return f"the closure returned {after}"
     if abs(after.kl) > (1 + _TOLERANCE) * max_kl:
         return f"a KL of {after.kl} with max_kl={max_kl}"
-    excess = after.constraint - np.maximum(before.constraint, tolerance)
+    # What the closure's dtype cannot tell apart is no change.
+    size = np.abs([before.objective, *before.constraint]) + reach
+    rounding = _ROUNDING * max(before.eps, after.eps) * size
+    tolerance = _TOLERANCE * reach[1:] + rounding[1:]
+    excess = after.constraint - np.maximum(before.constraint, 0) - tolerance
     if (excess > 0).any():
         i = excess.argmax()
         return f"constraint[{i}] went from {before.constraint[i]} to {after.constraint[i]}"
-    if (before.constraint <= 0).all() and after.objective < before.objective:
+    if (before.constraint <= 0).all() and after.objective < before.objective - rounding[0]:
         return f"the objective fell from {before.objective} to {after.objective}"
     return ""
 
@@ -533,6 +572,7 @@ def _move(params: list[Tensor], values: list[Tensor] | tuple[Tensor, ...]) -> No
 
 def _check_settings(settings: dict[str, Any]) -> None:
     allowed: dict[str, tuple[type, Callable[[Any], bool], str]] = {
+        "lr": (Real, lambda v: 0 < v < math.inf, "a positive finite number"),
         "max_kl": (Real, lambda v: 0 < v < math.inf, "a positive finite number"),
         "damping": (Real, lambda v: 0 <= v < math.inf, "a finite number, at least 0"),
         "cg_iters": (Integral, lambda v: v >= 1, "an integer, at least 1"),
@@ -541,6 +581,6 @@ def _check_settings(settings: dict[str, Any]) -> None:
         "recovery_ratio": (Real, lambda v: 0 < v <= 1, "in (0, 1]"),
     }
     for name, (kind, check, text) in allowed.items():
-        value = settings[name]
+        value = settings.get(name)
         if not (isinstance(value, kind) and check(value)):
             raise ValueError(f"{name} must be {text}, got {value!r}.")

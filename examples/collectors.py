@@ -13,6 +13,7 @@ from typing import Any
 
 import torch
 from omegaconf import DictConfig
+from streams import stream_seed
 from tensordict import TensorDict, TensorDictBase
 from torchrl.collectors import (
     BaseCollector,
@@ -223,8 +224,8 @@ def _ray_collector(
 
 
 def worker_seed(seed: int, worker: int) -> int:
-    """Seed of a worker's environments and draws; that of the first is the run's own."""
-    return seed + 7_919 * worker
+    """Seed of a worker's environments and draws."""
+    return stream_seed("worker", seed, worker)
 
 
 def _in_worker(make_env: Callable[..., EnvBase], num_envs: int, seed: int) -> EnvBase:

@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 import difflib
-import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from importlib.util import find_spec
 from numbers import Real
+from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
 import torch
 from collectors import BACKENDS
 from omegaconf import DictConfig, OmegaConf
+from options import flat
 from policy_steps import DISTANCES
 
 from torchrl_safe.envs import RANDOMIZATIONS, ROBOTS
+
+LARGEST = float(np.finfo(np.float32).max)
 
 
 class Rule(NamedTuple):
@@ -24,16 +28,16 @@ class Rule(NamedTuple):
     text: str
 
 
-def integer(low: int) -> Rule:
-    """A whole number of at least ``low``."""
+def integer(low: int, high: int = 2**31 - 1) -> Rule:
+    """A whole number between ``low`` and ``high``, by default the largest that C's int holds."""
     return Rule(
-        lambda v: isinstance(v, int) and not isinstance(v, bool) and v >= low,
-        f"an integer of at least {low}",
+        lambda v: isinstance(v, int) and not isinstance(v, bool) and low <= v <= high,
+        f"an integer of at least {low} and at most {high}",
     )
 
 
 def number(interval: str) -> Rule:
-    """A finite number in an interval such as ``[0, 1)`` or ``(0, inf)``."""
+    """A finite number in an interval such as ``[0, 1)`` or ``(0, inf)``, in single precision."""
     low, high = (float(end) for end in interval[1:-1].split(","))
     above = float.__gt__ if interval[0] == "(" else float.__ge__
     below = float.__lt__ if interval[-1] == ")" else float.__le__
@@ -41,10 +45,12 @@ def number(interval: str) -> Rule:
     def holds(value: Any) -> bool:
         if not isinstance(value, Real) or isinstance(value, bool):
             return False
-        value = float(value)
-        return math.isfinite(value) and above(value, low) and below(value, high)
+        if not abs(value) <= LARGEST:
+            return False
+        value = float(np.float32(value))  # as networks will have it: 1 - 1e-9 is 1
+        return above(value, low) and below(value, high)
 
-    return Rule(holds, f"a number in {interval}")
+    return Rule(holds, f"a number in {interval}, in single precision")
 
 
 def one_of(*choices: Any) -> Rule:
@@ -112,12 +118,15 @@ BOOLEAN = Rule(lambda v: isinstance(v, bool), "one of True, False")  # 1 == True
 PATH = Rule(lambda v: isinstance(v, str) and v != "", "a path")
 NAME = Rule(lambda v: isinstance(v, str) and v != "", "a name")
 
+FRAMES = 2**63 - 1  # what a counter of frames holds
+
 EXTRAS = ("tensorboard", "wandb", "ray")  # packages that bear the name of the extra
 
 RULES: dict[str, Rule] = {
-    "seed": integer(0),
+    "seed": integer(0, 2**64 - 1),
     "num_threads": integer(1),
     "device": device(),
+    "script": one_of(*sorted(file.stem for file in Path(__file__).parent.glob("*.yaml"))),
     "run_dir": PATH,
     "resume": BOOLEAN,
     "update": one_of("trust_region", "lagrangian", "pid"),
@@ -132,8 +141,8 @@ RULES: dict[str, Rule] = {
     "collector.backend": one_of(*BACKENDS),
     "collector.num_workers": integer(1),
     "collector.frames_per_batch": integer(1),
-    "collector.total_frames": integer(1),
-    "collector.init_frames": integer(0),
+    "collector.total_frames": integer(1, FRAMES),
+    "collector.init_frames": integer(0, FRAMES),
     "replay_buffer.storage": one_of("memory", "memmap"),
     "replay_buffer.size": integer(1),
     "replay_buffer.slice_len": integer(1),
@@ -159,7 +168,7 @@ RULES: dict[str, Rule] = {
     "loss.risk_level": number("(0, 1]"),
     "loss.cost_limit": number("[0, inf)"),
     "loss.initial_cost_limit": number("[0, inf)"),
-    "loss.anneal_frames": integer(0),
+    "loss.anneal_frames": integer(0, FRAMES),
     "loss.variance_reward": one_of("td_error", "second_moment"),
     "loss.clip_epsilon": number("(0, 1)"),
     "loss.entropy_coeff": number("[0, inf)"),
@@ -194,12 +203,12 @@ RULES: dict[str, Rule] = {
     "optim.recovery_ratio": number("(0, 1]"),
     "logger.backend": one_of("csv", "tensorboard", "wandb", ""),
     "logger.project_name": NAME,
-    "eval.interval": integer(1),
+    "eval.interval": integer(1, FRAMES),
     "eval.num_episodes": integer(1),
     "eval.final_episodes": integer(1),
     "eval.num_directions": integer(1),
     "eval.num_steps": integer(1),
-    "checkpoint.interval": integer(1),
+    "checkpoint.interval": integer(1, FRAMES),
     "checkpoint.keep_last": integer(1),
     "video.num_steps": integer(0),
 }
@@ -212,7 +221,7 @@ def check_config(cfg: DictConfig) -> None:
         ValueError: if an option is unknown, its value is impossible, or two do not go together.
         ModuleNotFoundError: if the package of a logger or collector is not installed.
     """
-    options = dict(_flat(OmegaConf.to_container(cfg, resolve=True)))
+    options = dict(flat(OmegaConf.to_container(cfg, resolve=True)))
     for name, value in options.items():
         if name not in RULES:
             close = difflib.get_close_matches(name, RULES) or sorted(RULES)
@@ -255,11 +264,3 @@ def _check_together(options: Mapping[str, Any]) -> None:
             raise ValueError(
                 f"{name} must be at most {ceiling}={options[ceiling]}, got {options[name]}."
             )
-
-
-def _flat(options: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    for name, value in options.items():
-        if isinstance(value, Mapping):
-            yield from _flat(value, f"{prefix}{name}.")
-        else:
-            yield prefix + name, value

@@ -17,7 +17,7 @@ from torchrl_safe.modules import export_policy
 def main(run_dir: Path, onnx: bool) -> Path:
     """Write the file into the run's folder."""
     cfg, _ = load_run(run_dir)
-    path = run_dir / ("policy.onnx" if onnx else "policy.pt2")
+    path = run_dir.expanduser() / ("policy.onnx" if onnx else "policy.pt2")
     export_policy(load_policy(run_dir), path, make_env(cfg, num_envs=1, seed=0).reset())
     print(path)
     return path

@@ -25,6 +25,7 @@ Controller = Callable[[NDArray[np.float32]], NDArray[np.float32]]
 
 def load(path: Path) -> Controller:
     """The file as a function of arrays."""
+    path = path.expanduser()
     if not path.is_file():
         raise FileNotFoundError(f"{path} is no file: export.py writes one from a run.")
     if path.suffix == ".onnx":

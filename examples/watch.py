@@ -42,6 +42,7 @@ def look(run_dir: Path) -> str:
 
 def main(run_dir: Path, every: float, once: bool) -> None:
     """Look until interrupted."""
+    run_dir = run_dir.expanduser()
     config = run_dir / "config.yaml"
     if not config.exists() or OmegaConf.load(config).logger.backend != "csv":
         raise FileNotFoundError(

@@ -85,7 +85,7 @@ def export_policy(
         >>> act(torch.zeros(7, 5)).shape
         torch.Size([7, 2])
     """
-    path = Path(path)
+    path = Path(path).expanduser()
     if path.suffix not in (".pt2", ".onnx"):
         raise ValueError(f"path must end in .pt2 or .onnx, got {str(path)!r}.")
     if example.ndim != 1:

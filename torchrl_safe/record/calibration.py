@@ -180,7 +180,7 @@ def plot_calibration(bins: TensorDict, path: str | os.PathLike[str]) -> Path:
         axes.set(xlim=(0, end), ylim=(0, end))
         axes.grid(alpha=0.25)
         axes.spines[["top", "right"]].set_visible(False)
-    path = Path(path)
+    path = Path(path).expanduser()
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=150)
     return path

@@ -52,9 +52,10 @@ def read_metrics(run_dir: str | os.PathLike[str]) -> dict[str, tuple[np.ndarray,
         >>> steps.tolist(), values.tolist()
         ([4000], [2.5])
     """
-    if not os.path.isdir(run_dir):
+    folder = Path(run_dir).expanduser()
+    if not folder.is_dir():
         raise FileNotFoundError(f"run_dir {os.fspath(run_dir)!r} is not a directory.")
-    scalars = Path(run_dir, "scalars")
+    scalars = folder / "scalars"
     metrics = {}
     for file in sorted(scalars.rglob("*.csv")):
         points = _read_points(file)
@@ -128,7 +129,7 @@ def plot_learning_curves(run_dir: str | os.PathLike[str], path: str | os.PathLik
             axes.set(xticks=[], yticks=[])
             axes.text(0.5, 0.5, "no data yet", transform=axes.transAxes, ha="center", color=_GREY)
 
-    path = Path(path)
+    path = Path(path).expanduser()
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=150)
     return path
@@ -164,7 +165,7 @@ def _read_points(file: Path) -> list[tuple[int, float]]:
     """(step, value) pairs with rising steps."""
     points: list[tuple[int, float]] = []
     # A line still without its newline may be half a number, which would parse all the same.
-    for line in file.read_text().rpartition("\n")[0].splitlines():
+    for line in file.read_text(encoding="utf-8", errors="replace").rpartition("\n")[0].splitlines():
         try:
             step_text, value_text = line.split(",")
             step, value = int(step_text), float(value_text)

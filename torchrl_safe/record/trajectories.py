@@ -183,7 +183,7 @@ def plot_trajectories(
         axes.set_title(f"goals {reached}, violations {inside.sum()}", fontsize=9)
         axes.set_aspect("equal")
         axes.tick_params(labelsize=7)
-    path = Path(path)
+    path = Path(path).expanduser()
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=120)
     return path

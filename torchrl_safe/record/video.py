@@ -74,7 +74,7 @@ def record_video(
         >>> record_video(env, env.rand_action, "point.mp4")  # doctest: +SKIP
         PosixPath('point.mp4')
     """
-    path = Path(path)
+    path = Path(path).expanduser()
     if path.suffix != ".mp4":
         raise ValueError(f"path must end in .mp4, got {str(path)!r}.")
     for name, value in (("num_steps", num_steps), ("every", every), ("fps", fps)):

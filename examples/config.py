@@ -221,6 +221,25 @@ def check_config(cfg: DictConfig) -> None:
         ValueError: if an option is unknown, its value is impossible, or two do not go together.
         ModuleNotFoundError: if the package of a logger or collector is not installed.
     """
+    options = check_options(cfg)
+    for name, plain in (("logger.backend", "csv"), ("collector.backend", "single")):
+        extra = options.get(name)
+        if extra in EXTRAS and find_spec(extra) is None:
+            raise ModuleNotFoundError(
+                f"{name}={extra} needs a package: pip install 'torchrl-safe[{extra}]'; "
+                f"{name}={plain} needs none."
+            )
+
+
+def check_options(cfg: DictConfig) -> dict[str, Any]:
+    """What of :func:`check_config` does not depend on the installed packages.
+
+    Returns:
+        dict: the options by their dotted names.
+
+    Raises:
+        ValueError: if an option is unknown, its value is impossible, or two do not go together.
+    """
     options = dict(flat(OmegaConf.to_container(cfg, resolve=True)))
     for name, value in options.items():
         if name not in RULES:
@@ -230,13 +249,7 @@ def check_config(cfg: DictConfig) -> None:
         if not rule.holds(value):
             raise ValueError(f"{name} must be {rule.text}, got {value!r}.")
     _check_together(options)
-    for name, plain in (("logger.backend", "csv"), ("collector.backend", "single")):
-        extra = options.get(name)
-        if extra in EXTRAS and find_spec(extra) is None:
-            raise ModuleNotFoundError(
-                f"{name}={extra} needs a package: pip install 'torchrl-safe[{extra}]'; "
-                f"{name}={plain} needs none."
-            )
+    return options
 
 
 def _check_together(options: Mapping[str, Any]) -> None:

@@ -14,9 +14,17 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-from checkpoints import write_atomically
 from omegaconf import DictConfig
 from torchrl.record.loggers import CSVLogger, Logger, TensorboardLogger, get_logger
+
+from torchrl_safe._files import (
+    DRAFT,
+    check_folder,
+    read_bytes,
+    regular_files,
+    replacing,
+    write_atomically,
+)
 
 NAME = "log"
 WANDB_ID = "wandb_id"
@@ -39,8 +47,13 @@ class Log:
     def __init__(self, cfg: DictConfig, path: Path, frames: int, *, finishing: bool) -> None:
         self._folder = path
         self._logger: Logger | None
+        if os.path.lexists(path / NAME):
+            regular_files(path / NAME)  # or a link would be written through
+        if os.path.lexists(path / "wandb"):
+            check_folder(path / "wandb")  # it makes links in there itself
         if cfg.logger.backend == "csv":
-            cut_csv(path / NAME, frames, finishing=finishing)
+            if (path / NAME).exists():
+                cut_csv(path / NAME, frames, finishing=finishing)
             self._logger = CSVLogger(NAME, str(path))
         elif cfg.logger.backend == "tensorboard":
             self._logger = _Purging(NAME, str(path), purge_step=frames + 1)
@@ -98,21 +111,22 @@ def cut_csv(log: Path, frames: int, *, finishing: bool = False) -> None:
     """End csv files at a frame: lines beyond it and a torn last line go, all others stay.
 
     Args:
-        log (Path): the csv logger's folder, which may be missing.
+        log (Path): the csv logger's folder.
         frames (int): the last one that stays.
         finishing (bool): whether the final evaluation at this frame goes, too. Defaults to False.
     """
-    for file in (log / "scalars").rglob("*.csv"):
-        last = frames
-        if finishing and file.relative_to(log / "scalars").parts[0] == "final":
-            last -= 1
+    for name, file in regular_files(log).items():
+        if file.name.startswith(DRAFT):
+            file.unlink()
+        if file.name.startswith(DRAFT) or file.suffix != ".csv":
+            continue
+        last = frames - 1 if finishing and name.startswith("scalars/final/") else frames
         content = file.read_bytes()
         lines = content.splitlines(keepends=True)
         kept = b"".join(line for line in lines if line.endswith(b"\n") and _step(line) <= last)
         if kept != content:
-            draft = file.with_name(f".{file.name}.draft")
-            draft.write_bytes(kept)
-            os.replace(draft, file)
+            with replacing(file) as draft:
+                draft.write_bytes(kept)
 
 
 def _step(line: bytes) -> int:
@@ -138,12 +152,11 @@ class _Purging(TensorboardLogger):
 def _wandb_id(path: Path) -> str:
     """The run's id at Weights & Biases, the same in all of its parts."""
     file = path / WANDB_ID
-    if not file.exists():
+    if not os.path.lexists(file):
         write_atomically(file, secrets.token_hex(4) + "\n")
-    with open(file, encoding="utf-8") as content:
-        name = content.read(100).strip()
+    name = read_bytes(file, 100).decode(errors="replace").strip()
     if not re.fullmatch("[0-9a-z]{8}", name):
-        raise ValueError(f"{file} must hold 8 digits and small letters, got {name!r}.")
+        raise ValueError(f"{file} must hold 8 digits and small letters, got {name!a}.")
     return name
 
 

@@ -18,7 +18,6 @@ from pathlib import Path
 
 import hydra
 import torch
-from checkpoints import write_atomically
 from config import check_config
 from descent import Descent
 from locks import FolderLock
@@ -37,6 +36,7 @@ from torchrl.modules import MLP, ProbabilisticActor, TanhNormal, ValueOperator
 from torchrl.objectives import SACLoss, SoftUpdate
 
 from torchrl_safe import RetraceEstimator
+from torchrl_safe._files import write_atomically
 
 COLUMNS = ("frames", "seconds", "eval_return", "train_return", "alpha", "loss_qvalue", "trace")
 

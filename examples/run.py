@@ -11,20 +11,34 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
-from checkpoints import adapter_of, latest, remove_leftovers, write_atomically
+from checkpoints import (
+    Rotation,
+    SealedCheckpoint,
+    latest,
+    read_manifest,
+    remove_leftovers,
+)
 from collectors import envs_per_batch
 from config import check_config
 from locks import FolderLock
 from logs import Log
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 from options import settings_of, settle
+from saved import CONFIG, Configuration, read_config, write_config
 from streams import stream_seed
 from tensordict import TensorDictBase
 from terminal import say
-from torchrl.checkpoint import Checkpoint, CheckpointRotation, GlobalRNGState
+from torchrl.checkpoint import GlobalRNGState
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType
 
+from torchrl_safe._files import (
+    JSON_LIMIT,
+    expand,
+    read_bytes,
+    read_json,
+    write_atomically,
+)
 from torchrl_safe.record import (
     describe,
     evaluate,
@@ -35,6 +49,7 @@ from torchrl_safe.record import (
 )
 
 HISTORY = "history.jsonl"
+RESULTS_LIMIT = 2**28  # bytes
 KINDS = {"eval/": ExplorationType.RANDOM, "eval/det/": ExplorationType.DETERMINISTIC}
 
 
@@ -67,10 +82,10 @@ class Run:
 
     def __init__(self, cfg: DictConfig) -> None:
         self.cfg = cfg
-        self.path = Path(cfg.run_dir).expanduser()
+        self.path = expand(cfg.run_dir)
         self.counters = Counters(frames=0, total_cvs=0, instabilities=0, seconds=0.0)
         self.changed: dict[str, tuple[Any, Any]] = {}
-        self.checkpoint = Checkpoint()
+        self.checkpoint = SealedCheckpoint()
         self._components: dict[str, Any] = {}
         self._saved: int | None = None  # frames of the newest checkpoint
         self._saved_options: DictConfig | None = None
@@ -114,7 +129,7 @@ class Run:
 
     def _settle(self) -> None:
         run_dir, resume = self.cfg.run_dir, self.cfg.resume
-        exists = (self.path / "config.yaml").exists()
+        exists = os.path.lexists(self.path / CONFIG)
         if not exists and latest(self.path) is not None:
             raise FileExistsError(
                 f"run_dir={run_dir} holds checkpoints but no config.yaml, without which nobody "
@@ -129,20 +144,20 @@ class Run:
             )
         if resume:
             remove_leftovers(self.path)
-            self._saved_options = OmegaConf.load(self.path / "config.yaml")
+            self._saved_options = read_config(self.path / CONFIG)
             self.cfg, self.changed = settle(self._saved_options, self.cfg)
             check_config(self.cfg)
         self.cfg.run_dir = str(self.path)
-        self.rotation = CheckpointRotation(
-            self.path / "checkpoints", keep_last=self.cfg.checkpoint.keep_last
+        self.rotation = Rotation(self.path, self.cfg.checkpoint.keep_last)
+        self.register(
+            config=Configuration(self.cfg), counters=self.counters, random=GlobalRNGState()
         )
-        self.register(counters=self.counters, random=GlobalRNGState())
 
     def register(self, **components: Any) -> None:
         """Name what a checkpoint keeps, besides counters and random state."""
         self._components |= components
         for name, component in components.items():
-            self.checkpoint.register(name, component, adapter=adapter_of(component))
+            self.checkpoint.register(name, component)
 
     @property
     def begins(self) -> bool:
@@ -180,7 +195,7 @@ class Run:
             say(f"from frame {self.frames} on, {name} is {new!r}; it was {old!r}")
         self._remember()
         # Last: where the log cannot be opened, there is no run.
-        write_atomically(self.path / "config.yaml", OmegaConf.to_yaml(self.cfg, resolve=True))
+        write_config(self.path / CONFIG, self.cfg)
 
     def close(self) -> None:
         """Close the log, and let go of the folder."""
@@ -207,8 +222,7 @@ class Run:
         if self.frames_left or any(n.startswith(("eval.", "video.")) for n in self.changed):
             return False
         try:
-            results = json.loads((self.path / "results.json").read_text(encoding="utf-8"))
-            return results["frames"] == self.frames
+            return read_json(self.path / "results.json", RESULTS_LIMIT)["frames"] == self.frames
         except (OSError, ValueError, TypeError, KeyError):
             return False  # none, or not a whole one: they are written again
 
@@ -226,7 +240,7 @@ class Run:
 
     def _check_collector(self, checkpoint: Path) -> None:
         """Episodes of several processes are in no checkpoint."""
-        if "collector" in self._components.keys() - Checkpoint.manifest(checkpoint)["components"]:
+        if "collector" in self._components.keys() - read_manifest(checkpoint)["components"]:
             raise ValueError(
                 f"collector.backend={self.cfg.collector.backend} goes on inside of episodes, "
                 f"and the checkpoints in run_dir={self.cfg.run_dir} hold none: leave "
@@ -242,8 +256,9 @@ class Run:
             "machine": platform.node(),
             "changed": {n: {"from": old, "to": new} for n, (old, new) in self.changed.items()},
         }
-        with open(self.path / HISTORY, "a", encoding="utf-8", newline="\n") as file:
-            file.write(json.dumps(entry) + "\n")
+        path = self.path / HISTORY
+        history = read_bytes(path, JSON_LIMIT).decode() if os.path.lexists(path) else ""
+        write_atomically(path, f"{history}{json.dumps(entry)}\n")
 
     def log(self, metrics: Mapping[str, float]) -> None:
         """Write metrics at the current frame.

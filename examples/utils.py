@@ -17,10 +17,11 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from checkpoints import latest, load_component
 from collectors import WorkerDied, make_collector
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 from run import Run
+from saved import from_newest
+from saved import load_run as load_run
 from streams import stream_seed
 from tensordict import TensorDictBase
 from terminal import GracefulStop, progress_bar, say
@@ -228,7 +229,7 @@ def closing_down(collector: BaseCollector) -> Iterator[None]:
 def load_policy(run_dir: str | os.PathLike[str]) -> GMMTanhPolicy:
     """The policy of a run, as its newest checkpoint has it.
 
-    Nothing is unpickled: weights are read as tensors, everything else as JSON and YAML.
+    Nothing is unpickled: weights are read as tensors, everything else as JSON.
 
     Args:
         run_dir (path): the run's folder.
@@ -237,27 +238,12 @@ def load_policy(run_dir: str | os.PathLike[str]) -> GMMTanhPolicy:
         FileNotFoundError: if it holds no run, or one without a checkpoint.
         CheckpointError: if the checkpoint is not what was written, or could run code.
     """
-    cfg, checkpoint = load_run(run_dir)
-    policy = make_policy(cfg, make_env(cfg, num_envs=1, seed=0))
-    load_component(checkpoint, "policy", policy)
-    return policy.eval().requires_grad_(False)
+    return from_newest(run_dir, saved_policy)
 
 
-def load_run(run_dir: str | os.PathLike[str]) -> tuple[DictConfig, Path]:
-    """A run's configuration and the path of its newest checkpoint.
-
-    A run is looked at on the CPU, wherever it was trained.
+def saved_policy(cfg: DictConfig, checkpoint: Path) -> GMMTanhPolicy:
+    """The policy of a checkpoint.
 
     Raises:
-        FileNotFoundError: if the folder holds no run, or one without a checkpoint.
-        CheckpointError: if the newest checkpoint cannot be read.
+        CheckpointError: if it is not what was written, or not finite.
     """
-    path = Path(run_dir).expanduser()
-    if not (path / "config.yaml").exists():
-        raise FileNotFoundError(f"run_dir={run_dir} holds no run: it has no config.yaml.")
-    checkpoint = latest(path)
-    if checkpoint is None:
-        raise FileNotFoundError(f"run_dir={run_dir} has no checkpoint yet.")
-    cfg = OmegaConf.load(path / "config.yaml")
-    cfg.device = "cpu"
-    return cfg, checkpoint

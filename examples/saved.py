@@ -1,0 +1,194 @@
+"""A run's folder for those who look at it: its configuration and its newest checkpoint."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, TypeVar
+
+import yaml
+from checkpoints import latest, load_components
+from config import check_options
+from omegaconf import DictConfig, OmegaConf
+from torchrl.checkpoint import CheckpointError
+
+from torchrl_safe._files import (
+    FileRefusedError,
+    expand,
+    open_regular,
+    printable,
+    read_bytes,
+    write_atomically,
+)
+
+CONFIG = "config.yaml"
+CONFIG_LIMIT = 2**18  # bytes
+SEAL = b"# SHA-256 of the lines above: "
+
+# What a look at a run may cost, whatever its configuration asks for.
+MOST = {"eval.num_steps": 1_000_000, "policy.num_components": 1_000}
+MOST_WEIGHTS = 2**28  # of one network
+ENDS = 1_000  # inputs and outputs for one component that no robot exceeds
+
+T = TypeVar("T")
+
+
+class Configuration:
+    """The resolved configuration as a component of each checkpoint.
+
+    Whoever goes on with a run keeps its own; the one of the checkpoint is in :attr:`saved`.
+
+    Args:
+        cfg (DictConfig, optional): the run's.
+    """
+
+    def __init__(self, cfg: DictConfig | None = None) -> None:
+        self.cfg = OmegaConf.create() if cfg is None else cfg
+        self.saved: dict[str, Any] = {}
+
+    def state_dict(self) -> dict[str, Any]:
+        """The options."""
+        return OmegaConf.to_container(self.cfg, resolve=True)
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Keep the options of a checkpoint."""
+        self.saved = dict(state)
+
+
+def write_config(path: Path, cfg: DictConfig) -> None:
+    """Write a resolved configuration, sealed by its last line."""
+    text = OmegaConf.to_yaml(cfg, resolve=True)
+    seal = hashlib.sha256(text.encode()).hexdigest()
+    write_atomically(path, f"{text}{SEAL.decode()}{seal}\n")
+
+
+def read_config(path: Path) -> DictConfig:
+    """A configuration as :func:`write_config` wrote it.
+
+    Raises:
+        FileNotFoundError: if there is none.
+        CheckpointError: if it was changed, or is more than plain YAML.
+    """
+    try:
+        content = read_bytes(path, CONFIG_LIMIT)
+    except FileRefusedError as error:
+        raise CheckpointError(str(error)) from None
+    sealed, _, seal = content.rpartition(SEAL)
+    if seal.decode(errors="replace").rstrip() != hashlib.sha256(sealed).hexdigest():
+        raise CheckpointError(
+            f"{printable(path)} is not what was written. Options are changed on the command line; "
+            "a run of an older version is read with that one."
+        )
+    try:
+        options = yaml.load(sealed.decode(), _PlainLoader)
+    except (yaml.YAMLError, RecursionError, ValueError) as error:
+        raise CheckpointError(f"{printable(path)} is no plain YAML: {printable(error)}") from None
+    return _plain_config(path, options)
+
+
+def load_run(run_dir: str | os.PathLike[str]) -> tuple[DictConfig, Path]:
+    """The configuration in a run's newest checkpoint, and the checkpoint's path.
+
+    A run is looked at on the CPU, wherever it was trained. While it trains, the checkpoint may be
+    gone when it is read: see :func:`from_newest`.
+
+    Raises:
+        FileNotFoundError: if the folder holds no run, or one without a checkpoint.
+        CheckpointError: if the newest checkpoint cannot be read.
+    """
+    path = expand(run_dir)
+    try:
+        open_regular(path / CONFIG).close()
+    except FileNotFoundError:
+        raise FileNotFoundError(
+            f"run_dir={printable(run_dir)} holds no run: it has no {CONFIG}."
+        ) from None
+    except FileRefusedError as error:
+        raise CheckpointError(str(error)) from None
+    checkpoint = latest(path)
+    if checkpoint is None:
+        raise FileNotFoundError(f"run_dir={printable(run_dir)} has no checkpoint yet.")
+    config = Configuration()
+    load_components(checkpoint, config=config)
+    cfg = _plain_config(checkpoint, config.saved)
+    try:
+        cfg.device = "cpu"
+        cfg.num_threads = min(cfg.num_threads, os.cpu_count() or 1)
+        check_options(cfg)
+        _check_cost(cfg)
+    except (ValueError, TypeError) as error:
+        raise CheckpointError(
+            f"the configuration in {printable(checkpoint)} is none: {printable(error)}"
+        ) from None
+    return cfg, checkpoint
+
+
+def from_newest(run_dir: str | os.PathLike[str], read: Callable[[DictConfig, Path], T]) -> T:
+    """What ``read`` makes of a run's configuration and newest checkpoint.
+
+    A run that trains deletes a checkpoint when it has written the next; then the next is read. All
+    that ``read`` returns is of one.
+
+    Args:
+        run_dir (path): the run's folder.
+        read (callable): loads what is wanted; it may be called again.
+
+    Raises:
+        FileNotFoundError: as :func:`load_run`.
+        CheckpointError: if the newest checkpoint cannot be read, and stays the newest.
+    """
+    while True:
+        checkpoint = latest(expand(run_dir))
+        try:
+            return read(*load_run(run_dir))
+        except (CheckpointError, OSError):
+            if checkpoint is None or os.path.lexists(checkpoint):
+                raise
+
+
+def _plain_config(path: Path, options: Any) -> DictConfig:
+    """Options without anything that OmegaConf would resolve."""
+    if not isinstance(options, dict):
+        raise CheckpointError(f"{printable(path)} holds no options.")
+    pending: list[Any] = [options]
+    while pending:
+        value = pending.pop()
+        if isinstance(value, dict):
+            pending += [*value, *value.values()]
+        elif isinstance(value, list):
+            pending += value
+        elif isinstance(value, str) and "${" in value:
+            raise CheckpointError(f"{printable(path)} refers to something else: {value!a}.")
+    try:
+        return OmegaConf.create(options)
+    except Exception as error:  # of kinds that are OmegaConf's own
+        raise CheckpointError(f"{printable(path)} holds no options: {printable(error)}") from None
+
+
+def _check_cost(cfg: DictConfig) -> None:
+    for name, most in MOST.items():
+        if (OmegaConf.select(cfg, name) or 0) > most:
+            raise ValueError(f"{name} must be at most {most:,} to look at a run.")
+    outputs = ENDS * (OmegaConf.select(cfg, "policy.num_components") or 1)
+    for name in ("policy.num_cells", "critic.num_cells", "network.num_cells"):
+        cells = OmegaConf.select(cfg, name) or []
+        if sum(a * b for a, b in zip([ENDS, *cells], [*cells, outputs])) > MOST_WEIGHTS:
+            raise ValueError(f"{name} must be of at most {MOST_WEIGHTS:,} weights.")
+
+
+class _PlainLoader(yaml.SafeLoader):
+    """YAML without aliases, which multiply, without tags, and with every key once."""
+
+    def compose_node(self, parent: Any, index: Any) -> Any:
+        event = self.peek_event()
+        if isinstance(event, yaml.AliasEvent) or event.anchor or getattr(event, "tag", None):
+            raise yaml.YAMLError("it has an alias, anchor or tag.")
+        return super().compose_node(parent, index)
+
+    def construct_mapping(self, node: Any, deep: bool = False) -> Any:
+        mapping = super().construct_mapping(node, deep)
+        if len(mapping) < len(node.value):
+            raise yaml.YAMLError("a key is there twice.")
+        return mapping

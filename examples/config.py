@@ -259,8 +259,10 @@ def _check_together(options: Mapping[str, Any]) -> None:
             "replay_buffer.storage=memmap keeps the replay on the CPU, so that device must be cpu, "
             f"got {options['device']!r}."
         )
+    workers = options.get("collector.backend", "single") != "single"
     for name, divisor in (
         ("collector.frames_per_batch", "env.num_envs"),
+        *((("env.num_envs", "collector.num_workers"),) if workers else ()),
         ("optim.critic_frames", "replay_buffer.slice_len"),
         ("replay_buffer.batch_size", "replay_buffer.slice_len"),
     ):

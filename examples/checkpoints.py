@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 import torch
 from tensordict import TensorDict
-from torch import Tensor, nn
+from torch import Tensor
 from torch.utils._pytree import tree_leaves
 from torchrl.checkpoint import (
     Checkpoint,
@@ -58,7 +58,6 @@ MANIFEST = "manifest.json"
 DIGESTS = "digests.json"
 SUFFIXES = (".json", ".memmap")
 SPARE = 2**20  # bytes: what is written besides tensors
-OLDER = "It was written by an older version: read it with that one, or train again"
 
 
 class SealedCheckpoint(Checkpoint):
@@ -102,9 +101,23 @@ class SealedCheckpoint(Checkpoint):
         return destination
 
     def load(
-        self, path: str | Path, *, components: Collection[str] | None = None, **options: Any
+        self,
+        path: str | Path,
+        *,
+        components: Collection[str] | None = None,
+        fixed_size: bool = False,
+        **options: Any,
     ) -> CheckpointLoadResult:
         """Load components if all of them are what was written; else none is touched.
+
+        Args:
+            path (path): the checkpoint.
+
+        Keyword Args:
+            components (collection of str, optional): their names. Defaults to all.
+            fixed_size (bool): whether they have as many numbers as was saved of them, so that more
+                is refused before it is read. Optimizers and buffers have not. Defaults to False.
+            **options: as TorchRL's.
 
         Raises:
             CheckpointError: if a file is missing, changed, added, or could do anything but be read.
@@ -113,7 +126,9 @@ class SealedCheckpoint(Checkpoint):
         manifest = read_manifest(path)
         for name in self.components if components is None else components:
             if name in manifest["components"]:
-                check_component(path, manifest, name, _most_bytes(self.components[name]))
+                state = self.components[name].state_dict() if fixed_size else None
+                most_bytes = _nbytes(state) + SPARE if fixed_size else math.inf
+                check_component(path, manifest, name, most_bytes)
         return super().load(path, components=components, **options)
 
 
@@ -245,7 +260,7 @@ def load_components(checkpoint: Path, **components: Any) -> None:
     Raises:
         CheckpointError: if one is missing, not what was written, or of other shapes.
     """
-    SealedCheckpoint(**components).load(checkpoint, map_location="cpu")
+    SealedCheckpoint(**components).load(checkpoint, fixed_size=True, map_location="cpu")
 
 
 def remove_leftovers(run_dir: Path) -> None:
@@ -297,7 +312,8 @@ def read_manifest(checkpoint: Path) -> dict[str, Any]:
     digests = metadata.get("digests") if isinstance(metadata, dict) else None
     if not _are_digests(digests):
         raise CheckpointError(
-            f"the manifest of {printable(checkpoint)} has no digests of its components. {OLDER}."
+            f"the manifest of {printable(checkpoint)} has no digests of its components. If it was "
+            "written by an older version, read it with that one, or train again."
         )
     return manifest
 
@@ -379,7 +395,10 @@ def _check_files(
                 f"holds {' and '.join(SUFFIXES)} files alone. Delete it if you trust the others."
             )
     if DIGESTS not in files:
-        raise CheckpointError(f"{printable(folder / DIGESTS)} is missing. {OLDER}.")
+        raise CheckpointError(
+            f"{printable(folder / DIGESTS)} is missing: nothing shows that the others are what was "
+            "written."
+        )
     content = read_bytes(files[DIGESTS], JSON_LIMIT)
     if hashlib.sha256(content).hexdigest() != expected_seal:
         raise CheckpointError(f"{printable(folder / DIGESTS)} is not what was written.")
@@ -497,7 +516,7 @@ def _kinds(value: Any) -> Iterator[str]:
 
 @contextmanager
 def _pickling_off() -> Iterator[None]:
-    """Tensordict warns before it unpickles what it was not told to; TorchRL cannot tell it."""
+    """No pickle for loaders that cannot say so: tensordict warns before it unpickles unasked."""
     with warnings.catch_warnings():
         warnings.simplefilter("error", FutureWarning)
         yield
@@ -515,13 +534,6 @@ def _own_names(folder: Path) -> list[Path]:
         and path.name == f"checkpoint-{int(found[1]):012d}"
     }
     return [steps[step] for step in sorted(steps)]
-
-
-def _most_bytes(component: Any) -> float:
-    """What a component's files can hold; of what grows while it is used, that is not known."""
-    if isinstance(component, nn.Module):
-        return _nbytes(component.state_dict()) + SPARE
-    return math.inf
 
 
 def _nbytes(state: Any) -> int:

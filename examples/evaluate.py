@@ -13,18 +13,21 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
+from typing import NamedTuple
 
 import torch
-from checkpoints import load_component
+from checkpoints import load_components
 from critics import make_losses
 from omegaconf import DictConfig
 from run import write_results
+from saved import from_newest
 from streams import stream_seed
 from tensordict import TensorDictBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
-from utils import load_policy, load_run, make_env
+from utils import make_env, saved_policy
 
 from torchrl_safe import CVaRCostLoss, GMMTanhPolicy
+from torchrl_safe._files import expand, make_folder, printable
 from torchrl_safe.envs import RANDOMIZATIONS, SafeGoalEnv
 from torchrl_safe.record import (
     calibrate,
@@ -43,15 +46,28 @@ NUM_FILMED = 9
 SEED = 0  # of layouts that neither training nor its evaluations see, whatever the number
 
 
-def load_cost_loss(
-    cfg: DictConfig, checkpoint: Path, env: SafeGoalEnv, policy: GMMTanhPolicy
-) -> CVaRCostLoss | None:
-    """The safety critics of a run of safetac_point.py; None for the other methods' runs."""
+class Subject(NamedTuple):
+    """What is evaluated, all of one checkpoint.
+
+    Attributes:
+        cfg: the configuration.
+        policy: the policy.
+        cost_loss: the safety critics of a run of safetac_point.py; None for the other methods'.
+    """
+
+    cfg: DictConfig
+    policy: GMMTanhPolicy
+    cost_loss: CVaRCostLoss | None
+
+
+def load(cfg: DictConfig, checkpoint: Path) -> Subject:
+    """Read a checkpoint."""
+    policy = saved_policy(cfg, checkpoint)
     if "variance_reward" not in cfg.loss:
-        return None
-    _, cost_loss = make_losses(cfg, env, policy)
-    load_component(checkpoint, "cost_loss", cost_loss)
-    return cost_loss
+        return Subject(cfg, policy, None)
+    _, cost_loss = make_losses(cfg, make_env(cfg, num_envs=1, seed=0), policy)
+    load_components(checkpoint, cost_loss=cost_loss)
+    return Subject(cfg, policy, cost_loss)
 
 
 def shares(episodes: TensorDictBase, prefix: str) -> dict[str, float]:
@@ -91,16 +107,15 @@ def main(
     run_dir: Path, episodes: int, seed: int, film: bool, randomization: str | None = None
 ) -> dict[str, float]:
     """Evaluate, draw, and return the numbers."""
-    cfg, checkpoint = load_run(run_dir)
-    policy = load_policy(run_dir)
+    run_dir = expand(run_dir)
+    # Before the episodes: a run that still trains replaces its checkpoint meanwhile.
+    cfg, policy, cost_loss = from_newest(run_dir, load)
     num_steps = cfg.eval.num_steps
-    run_dir = run_dir.expanduser()
     seed = stream_seed("evaluate.py", seed)
     out = run_dir / (f"evaluation_{randomization}" if randomization else "evaluation")
+    make_folder(out)
     options = {"episode_length": num_steps, "randomization": RANDOMIZATIONS.get(randomization)}
     env = make_env(cfg, episodes, seed, **options)
-    # Before the episodes: a run that still trains replaces its checkpoint meanwhile.
-    cost_loss = load_cost_loss(cfg, checkpoint, env, policy)
     metrics: dict[str, float] = {}
     episodes_played = {}
     for prefix, kind in (("det/", "DETERMINISTIC"), ("sampled/", "RANDOM")):
@@ -152,7 +167,7 @@ def main(
             print(f"no video: {error}")
         small.close()
     env.close()
-    print(f"written to {out}")
+    print(f"written to {printable(out)}")
     return metrics
 
 

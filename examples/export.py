@@ -9,17 +9,27 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from utils import load_policy, load_run, make_env
+from omegaconf import DictConfig
+from saved import from_newest
+from tensordict import TensorDictBase
+from utils import make_env, saved_policy
 
+from torchrl_safe import GMMTanhPolicy
+from torchrl_safe._files import expand, printable
 from torchrl_safe.modules import export_policy
+
+
+def load(cfg: DictConfig, checkpoint: Path) -> tuple[GMMTanhPolicy, TensorDictBase]:
+    """The policy of a checkpoint, and an observation."""
+    return saved_policy(cfg, checkpoint), make_env(cfg, num_envs=1, seed=0).reset()
 
 
 def main(run_dir: Path, onnx: bool) -> Path:
     """Write the file into the run's folder."""
-    cfg, _ = load_run(run_dir)
-    path = run_dir.expanduser() / ("policy.onnx" if onnx else "policy.pt2")
-    export_policy(load_policy(run_dir), path, make_env(cfg, num_envs=1, seed=0).reset())
-    print(path)
+    policy, example = from_newest(run_dir, load)
+    path = expand(run_dir) / ("policy.onnx" if onnx else "policy.pt2")
+    export_policy(policy, path, example)
+    print(printable(path))
     return path
 
 

@@ -18,6 +18,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from torchrl_safe._files import expand, printable
 from torchrl_safe.envs import SafeGoalEnv
 
 Controller = Callable[[NDArray[np.float32]], NDArray[np.float32]]
@@ -25,13 +26,14 @@ Controller = Callable[[NDArray[np.float32]], NDArray[np.float32]]
 
 def load(path: Path) -> Controller:
     """The file as a function of arrays."""
-    path = path.expanduser()
+    path = expand(path)
     if not path.is_file():
-        raise FileNotFoundError(f"{path} is no file: export.py writes one from a run.")
+        raise FileNotFoundError(f"{printable(path)} is no file: export.py writes one from a run.")
     if path.suffix == ".onnx":
         if find_spec("onnxruntime") is None:
             raise ModuleNotFoundError(
-                f"{path} needs a runtime: pip install 'torchrl-safe[export]', or onnxruntime alone."
+                f"{printable(path)} needs a runtime: pip install 'torchrl-safe[export]', or "
+                "onnxruntime alone."
             )
         import onnxruntime
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import itertools
 import os
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -174,7 +175,8 @@ def _check_cost(cfg: DictConfig) -> None:
     outputs = ENDS * (OmegaConf.select(cfg, "policy.num_components") or 1)
     for name in ("policy.num_cells", "critic.num_cells", "network.num_cells"):
         cells = OmegaConf.select(cfg, name) or []
-        if sum(a * b for a, b in zip([ENDS, *cells], [*cells, outputs])) > MOST_WEIGHTS:
+        sizes = [ENDS, *cells, outputs]
+        if sum(a * b for a, b in itertools.pairwise(sizes)) > MOST_WEIGHTS:
             raise ValueError(f"{name} must be of at most {MOST_WEIGHTS:,} weights.")
 
 

@@ -15,42 +15,48 @@ import contextlib
 import time
 from pathlib import Path
 
-from omegaconf import OmegaConf
+from saved import CONFIG, read_config
 
+from torchrl_safe._files import check_folder, expand, printable
 from torchrl_safe.record import format_table, plot_learning_curves, read_metrics
 
 
 def look(run_dir: Path) -> str:
     """Draw the curves, and say what the log says last."""
-    cfg = OmegaConf.load(run_dir / "config.yaml")
+    run_dir = expand(run_dir)
+    cfg = read_config(run_dir / CONFIG)
     log = run_dir / "log"
+    check_folder(log)
     curves = read_metrics(log)
     if not curves:
         return "nothing logged yet"
     plot_learning_curves(log, run_dir / "curves.png")
     frames = int(max(steps[-1] for steps, _ in curves.values()))
-    speed = curves["time/frames_per_second"][1][-1]
     total = cfg.collector.total_frames
-    left = max(total - frames, 0) / speed
-    rows: dict[str, float | str] = {
-        "frames": f"{frames:,} of {total:,}",
-        "time left": f"{left // 3600:.0f} h {left % 3600 // 60:.0f} min",
-    }
-    rows |= {name: float(values[-1]) for name, (_, values) in curves.items()}
-    return format_table(rows)
+    rows: dict[str, float | str] = {"frames": f"{frames:,} of {total:,}"}
+    _, speeds = curves.get("time/frames_per_second", (None, [0.0]))
+    if speeds[-1] > 0:
+        left = max(total - frames, 0) / speeds[-1]
+        rows["time left"] = f"{left // 3600:.0f} h {left % 3600 // 60:.0f} min"
+    metrics = {name: float(values[-1]) for name, (_, values) in curves.items()}
+    return format_table(rows | metrics | rows)  # no metric passes for them
 
 
 def main(run_dir: Path, every: float, once: bool) -> None:
     """Look until interrupted."""
-    run_dir = run_dir.expanduser()
-    config = run_dir / "config.yaml"
-    if not config.exists() or OmegaConf.load(config).logger.backend != "csv":
+    run_dir = expand(run_dir)
+    try:
+        backend = read_config(run_dir / CONFIG).logger.backend
+    except FileNotFoundError:
+        backend = None
+    if backend != "csv":
         raise FileNotFoundError(
-            f"run_dir={run_dir} has no csv log: it is no run, or was started with another "
-            "logger.backend."
+            f"run_dir={printable(run_dir)} has no csv log: it is no run, or was started with "
+            "another logger.backend."
         )
+    picture = printable(run_dir / "curves.png")
     while True:
-        print(f"{look(run_dir)}\n{run_dir / 'curves.png'} drawn at {time.strftime('%H:%M:%S')}\n")
+        print(f"{look(run_dir)}\n{picture} drawn at {time.strftime('%H:%M:%S')}\n")
         if once:
             return
         time.sleep(every)

@@ -37,11 +37,11 @@ def expand(path: str | os.PathLike[str]) -> Path:
 
 
 def printable(text: object) -> str:
-    """Text that a terminal shows instead of obeying: what is no plain character is escaped.
+    r"""Text that a terminal shows instead of obeying: what is no plain character is escaped.
 
     Examples:
-        >>> printable("Läufe/\\x1b[2Jrun")
-        'Läufe/\\\\x1b[2Jrun'
+        >>> print(printable("Läufe/\x1b[2Jrun"))
+        Läufe/\x1b[2Jrun
     """
     return "".join(c if c.isprintable() else ascii(c)[1:-1] for c in str(text))
 
@@ -169,7 +169,7 @@ def replacing(path: Path) -> Iterator[Path]:
 
 
 def write_atomically(path: Path, text: str) -> None:
-    """Replaces a file's content by UTF-8: whoever reads it sees the old or the new, never a part."""
+    """Replaces a file's content by UTF-8: whoever reads it sees the old or the new."""
     with replacing(path) as draft:
         draft.write_bytes(text.encode())
 

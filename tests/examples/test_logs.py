@@ -100,7 +100,9 @@ def test_wandb_has_one_id(tmp_path, monkeypatch):
         (tmp_path / name).mkdir(exist_ok=True)
         write(tmp_path / name, frames, "wandb", after)
     ids = {
-        name: [path.name.rsplit("-", 1)[1] for path in (tmp_path / name).glob("wandb/offline-run-*")]
+        name: [
+            path.name.rsplit("-", 1)[1] for path in (tmp_path / name).glob("wandb/offline-run-*")
+        ]
         for name in "ab"
     }
     assert len(ids["a"]) == 2

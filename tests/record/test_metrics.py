@@ -130,9 +130,7 @@ def brute_force(script: dict[str, torch.Tensor], n: int, num_steps: int, action:
         cv += int(script["violation"][t, n].item())
         goals += int(script["goal_met"][t, n].item())
         length += 1
-        terminated, truncated = (
-            script[name][t, n].item() for name in ("terminated", "truncated")
-        )
+        terminated, truncated = (script[name][t, n].item() for name in ("terminated", "truncated"))
         if terminated or truncated:
             break
     return {

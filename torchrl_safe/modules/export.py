@@ -11,6 +11,8 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 from torchrl.modules import ProbabilisticActor
 
+from torchrl_safe._files import expand, replacing
+
 __all__ = ["DeterministicAction", "export_policy"]
 
 
@@ -59,7 +61,8 @@ def export_policy(
 
     Args:
         policy (ProbabilisticActor): an actor whose distribution has a ``deterministic_sample``.
-        path (path): the file; its suffix picks the format. Missing parents are made.
+        path (path): the file; its suffix picks the format. It appears whole or not at all. Missing
+            parents are made.
         example (TensorDictBase): batch size [B] with the policy's ``in_keys``, such as
             ``env.reset()``; its values do not matter, its shapes and types do.
 
@@ -85,7 +88,7 @@ def export_policy(
         >>> act(torch.zeros(7, 5)).shape
         torch.Size([7, 2])
     """
-    path = Path(path).expanduser()
+    path = expand(path)
     if path.suffix not in (".pt2", ".onnx"):
         raise ValueError(f"path must end in .pt2 or .onnx, got {str(path)!r}.")
     if example.ndim != 1:
@@ -108,18 +111,19 @@ def export_policy(
         warnings.simplefilter("ignore", FutureWarning)
         warnings.simplefilter("ignore", DeprecationWarning)
         program = torch.export.export(model, inputs, dynamic_shapes=shapes, strict=False)
-        if path.suffix == ".pt2":
-            torch.export.save(program, path)
-        else:
-            torch.onnx.export(
-                program,
-                (),
-                path,
-                input_names=[_flat(key) for key in policy.in_keys],
-                output_names=["action"],
-                external_data=False,
-                verbose=False,
-            )
+        with replacing(path) as draft:
+            if path.suffix == ".pt2":
+                torch.export.save(program, draft)
+            else:
+                torch.onnx.export(
+                    program,
+                    (),
+                    draft,
+                    input_names=[_flat(key) for key in policy.in_keys],
+                    output_names=["action"],
+                    external_data=False,
+                    verbose=False,
+                )
     return path
 
 

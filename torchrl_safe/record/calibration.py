@@ -14,6 +14,8 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
+from torchrl_safe._files import expand, replacing
+
 __all__ = ["calibrate", "discounted_sums", "plot_calibration"]
 
 _NUM_RESAMPLES = 500
@@ -180,9 +182,10 @@ def plot_calibration(bins: TensorDict, path: str | os.PathLike[str]) -> Path:
         axes.set(xlim=(0, end), ylim=(0, end))
         axes.grid(alpha=0.25)
         axes.spines[["top", "right"]].set_visible(False)
-    path = Path(path).expanduser()
+    path = expand(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=150)
+    with replacing(path) as draft:
+        figure.savefig(draft, dpi=150)
     return path
 
 

@@ -12,12 +12,16 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from torchrl_safe._files import expand, printable, read_bytes, regular_files, replacing
+
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 __all__ = ["format_table", "plot_learning_curves", "read_metrics"]
 
 Curves = Mapping[str, tuple[np.ndarray, np.ndarray]]
+
+_LOG_LIMIT = 2**25  # bytes of one metric
 
 # Okabe and Ito's colours, told apart by every kind of colour vision; line styles say it again.
 _BLUE, _VERMILLION, _GREY, _BLACK = "#0072B2", "#D55E00", "#999999", "#000000"
@@ -26,7 +30,8 @@ _BLUE, _VERMILLION, _GREY, _BLACK = "#0072B2", "#D55E00", "#999999", "#000000"
 def read_metrics(run_dir: str | os.PathLike[str]) -> dict[str, tuple[np.ndarray, np.ndarray]]:
     """Reads every scalar of a run that was logged by :class:`torchrl.record.CSVLogger`.
 
-    A run that was killed and resumed reads as one: lines torn by the kill are skipped, and where
+    A run that was killed and resumed reads as one: lines that are no step and number are skipped,
+    be they torn by the kill or by a bad disk, and where
     the resumed run starts again at an earlier step, what the killed one had logged from there on
     is dropped. Steps therefore always rise.
 
@@ -40,6 +45,8 @@ def read_metrics(run_dir: str | os.PathLike[str]) -> dict[str, tuple[np.ndarray,
 
     Raises:
         FileNotFoundError: if ``run_dir`` is not a directory.
+        FileRefusedError: a ``ValueError``, if below it there is a link, a pipe or the like, a
+            folder that cannot be listed, or a log of more than 32 MiB.
 
     Examples:
         >>> import tempfile
@@ -52,17 +59,20 @@ def read_metrics(run_dir: str | os.PathLike[str]) -> dict[str, tuple[np.ndarray,
         >>> steps.tolist(), values.tolist()
         ([4000], [2.5])
     """
-    folder = Path(run_dir).expanduser()
+    folder = expand(run_dir)
     if not folder.is_dir():
         raise FileNotFoundError(f"run_dir {os.fspath(run_dir)!r} is not a directory.")
     scalars = folder / "scalars"
+    files = regular_files(scalars) if os.path.lexists(scalars) else {}
     metrics = {}
-    for file in sorted(scalars.rglob("*.csv")):
-        points = _read_points(file)
+    for name, file in files.items():
+        points = _read_points(file) if file.suffix == ".csv" else []
         if points:
             steps, values = zip(*points, strict=True)
-            name = file.relative_to(scalars).with_suffix("").as_posix()
-            metrics[name] = np.array(steps, np.int64), np.array(values, np.float64)
+            metrics[name.removesuffix(".csv")] = (
+                np.array(steps, np.int64),
+                np.array(values, np.float64),
+            )
     return metrics
 
 
@@ -129,9 +139,10 @@ def plot_learning_curves(run_dir: str | os.PathLike[str], path: str | os.PathLik
             axes.set(xticks=[], yticks=[])
             axes.text(0.5, 0.5, "no data yet", transform=axes.transAxes, ha="center", color=_GREY)
 
-    path = Path(path).expanduser()
+    path = expand(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=150)
+    with replacing(path) as draft:
+        figure.savefig(draft, dpi=150)
     return path
 
 
@@ -140,7 +151,8 @@ def format_table(rows: Mapping[str, float | str]) -> str:
 
     Args:
         rows (mapping): name to value. Numbers are shown with four significant digits, from 1,000
-            on as whole numbers with separators; strings as they are.
+            on as whole numbers with separators; strings as they are. What a terminal would obey
+            instead of showing is escaped, in names, too.
 
     Returns:
         str: one line per row, without a final newline.
@@ -149,7 +161,7 @@ def format_table(rows: Mapping[str, float | str]) -> str:
         >>> format_table({"score": 10.4251, "total CVs": 116000}).splitlines()
         ['score        10.43', 'total CVs  116,000']
     """
-    cells = {name: _format_value(value) for name, value in rows.items()}
+    cells = {printable(name): printable(_format_value(value)) for name, value in rows.items()}
     left = max(map(len, cells), default=0)
     right = max(map(len, cells.values()), default=0)
     return "\n".join(f"{name:<{left}}  {value:>{right}}" for name, value in cells.items())
@@ -165,11 +177,14 @@ def _read_points(file: Path) -> list[tuple[int, float]]:
     """(step, value) pairs with rising steps."""
     points: list[tuple[int, float]] = []
     # A line still without its newline may be half a number, which would parse all the same.
-    for line in file.read_text(encoding="utf-8", errors="replace").rpartition("\n")[0].splitlines():
+    text = read_bytes(file, _LOG_LIMIT).decode(errors="replace")
+    for line in text.rpartition("\n")[0].split("\n"):
         try:
             step_text, value_text = line.split(",")
             step, value = int(step_text), float(value_text)
         except ValueError:
+            continue
+        if not 0 <= step < 2**63:
             continue
         while points and points[-1][0] >= step:
             points.pop()

@@ -14,6 +14,7 @@ from tensordict import TensorDictBase
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType
 
+from torchrl_safe._files import expand, replacing
 from torchrl_safe.record.metrics import acting
 
 __all__ = ["Trajectory", "plot_trajectories", "record_trajectories"]
@@ -183,9 +184,10 @@ def plot_trajectories(
         axes.set_title(f"goals {reached}, violations {inside.sum()}", fontsize=9)
         axes.set_aspect("equal")
         axes.tick_params(labelsize=7)
-    path = Path(path).expanduser()
+    path = expand(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=120)
+    with replacing(path) as draft:
+        figure.savefig(draft, dpi=120)
     return path
 
 

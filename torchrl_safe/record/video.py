@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import os
-import tempfile
 from collections.abc import Callable, Sequence
 from contextlib import closing
 from pathlib import Path
@@ -16,6 +15,7 @@ from tensordict import TensorDictBase
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType
 
+from torchrl_safe._files import expand, replacing
 from torchrl_safe.record.metrics import acting
 
 __all__ = ["record_video"]
@@ -74,7 +74,7 @@ def record_video(
         >>> record_video(env, env.rand_action, "point.mp4")  # doctest: +SKIP
         PosixPath('point.mp4')
     """
-    path = Path(path).expanduser()
+    path = expand(path)
     if path.suffix != ".mp4":
         raise ValueError(f"path must end in .mp4, got {str(path)!r}.")
     for name, value in (("num_steps", num_steps), ("every", every), ("fps", fps)):
@@ -103,11 +103,10 @@ def record_video(
             ) from error
 
     path.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(dir=path.parent, prefix=".video-") as folder:
-        whole = Path(folder, path.name)
+    with replacing(path) as draft:
         # macro_block_size: even sizes are kept as they are; faststart: plays while it loads.
         writer = imageio.get_writer(
-            whole,
+            draft,
             format="FFMPEG",
             fps=fps,
             codec="libx264",
@@ -131,7 +130,6 @@ def record_video(
                 running -= {i for i in running if done[i]}
                 if not running:
                     break
-        os.replace(whole, path)
     return path
 
 

@@ -91,7 +91,7 @@ def make_collector(
 
 def envs_per_batch(cfg: DictConfig) -> int:
     """How many environments a batch of :func:`make_collector` is of."""
-    shared = cfg.collector.backend == "multi_async"
+    shared = cfg.collector.get("backend") == "multi_async"
     return cfg.env.num_envs // (cfg.collector.num_workers if shared else 1)
 
 

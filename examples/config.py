@@ -50,7 +50,7 @@ def number(interval: str) -> Rule:
         value = float(np.float32(value))  # as networks will have it: 1 - 1e-9 is 1
         return above(value, low) and below(value, high)
 
-    return Rule(holds, f"a number in {interval}, in single precision")
+    return Rule(holds, f"a number in {interval}")
 
 
 def one_of(*choices: Any) -> Rule:
@@ -247,9 +247,19 @@ def check_options(cfg: DictConfig) -> dict[str, Any]:
             raise ValueError(f"{name} is not an option; there are {', '.join(close)}.")
         rule = RULES[name]
         if not rule.holds(value):
-            raise ValueError(f"{name} must be {rule.text}, got {value!r}.")
+            raise ValueError(f"{name} must be {rule.text}, got {_shown(value)}.")
     _check_together(options)
     return options
+
+
+def _shown(value: Any) -> str:
+    """A value as it was written, and where it differs visibly, as networks will have it."""
+    if not isinstance(value, float):
+        return repr(value)
+    with np.errstate(over="ignore", under="ignore"):
+        single = np.float32(value)
+    rounded = value not in (0, 1) and single in (0, 1, np.inf, -np.inf) and abs(value) < np.inf
+    return f"{value!r}, which is {single} in single precision" if rounded else repr(value)
 
 
 def _check_together(options: Mapping[str, Any]) -> None:
@@ -270,6 +280,8 @@ def _check_together(options: Mapping[str, Any]) -> None:
             raise ValueError(
                 f"{name} must be a multiple of {divisor}={options[divisor]}, got {options[name]}."
             )
+    if {"replay_buffer.slice_len", "env.num_envs"} <= options.keys():
+        _check_slices(options)
     for name, ceiling in (
         ("replay_buffer.slice_len", "env.episode_length"),
         ("collector.frames_per_batch", "replay_buffer.size"),
@@ -279,3 +291,21 @@ def _check_together(options: Mapping[str, Any]) -> None:
             raise ValueError(
                 f"{name} must be at most {ceiling}={options[ceiling]}, got {options[name]}."
             )
+
+
+def _check_slices(options: Mapping[str, Any]) -> None:
+    """The first update replays slices of trajectories that must be there by then."""
+    frames, slice_len = options["collector.frames_per_batch"], options["replay_buffer.slice_len"]
+    num_envs = options["env.num_envs"]
+    batches = max(1, -(-options["collector.init_frames"] // frames))
+    if options["collector.backend"] == "multi_async":  # the next batch is another worker's
+        num_envs, batches = num_envs // options["collector.num_workers"], 1
+    steps = frames // num_envs
+    if steps < 2 or batches * steps < slice_len:
+        least = num_envs * max(2, -(-slice_len // batches))
+        raise ValueError(
+            f"collector.frames_per_batch must be at least {least}, got {frames}: {num_envs} "
+            f"environments must take {slice_len} steps (replay_buffer.slice_len), and 2 in every "
+            f"batch, before the first update at collector.init_frames="
+            f"{options['collector.init_frames']}."
+        )

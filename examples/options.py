@@ -8,6 +8,7 @@ from typing import Any
 
 import hydra
 import torch
+from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import DictConfig, OmegaConf
@@ -149,8 +150,13 @@ def _defaults(cfg: DictConfig) -> DictConfig | None:
     """The options of the script's own files."""
     if "script" not in cfg:
         return None
-    with hydra.initialize_config_dir(str(Path(__file__).resolve().parent), version_base="1.3"):
-        return hydra.compose(cfg.script)
+    hydras = GlobalHydra.instance()
+    running, hydras.hydra = hydras.hydra, None  # there is room for one, and hydra.main has it
+    try:
+        with hydra.initialize_config_dir(str(Path(__file__).resolve().parent), version_base="1.3"):
+            return hydra.compose(cfg.script)
+    finally:
+        hydras.hydra = running
 
 
 def _differing(cfg: DictConfig, defaults: DictConfig | None) -> set[str]:

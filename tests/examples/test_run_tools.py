@@ -3,10 +3,15 @@
 from __future__ import annotations
 
 import json
+import shutil
 import subprocess
 import sys
+import threading
+from collections import OrderedDict
 from pathlib import Path
+from types import SimpleNamespace
 
+import checkpoints
 import evaluate
 import export
 import numpy as np
@@ -14,9 +19,12 @@ import pytest
 import run_exported
 import torch
 import watch
+from omegaconf import OmegaConf
+from saved import Configuration, read_config, write_config
 from streams import stream_seed
 from tensordict import TensorDict
 from test_safetac_point import launch
+from torchrl.checkpoint import CheckpointError
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from utils import load_policy, load_run, make_env
 
@@ -122,7 +130,7 @@ def test_watch_without_a_log(tmp_path):
     with pytest.raises(FileNotFoundError, match="no csv log"):
         watch.main(tmp_path, every=1.0, once=True)
     (tmp_path / "log").mkdir()
-    (tmp_path / "config.yaml").write_text("logger: {backend: tensorboard}")
+    write_config(tmp_path / "config.yaml", OmegaConf.create({"logger": {"backend": "tensorboard"}}))
     with pytest.raises(FileNotFoundError, match="another logger"):
         watch.main(tmp_path, every=1.0, once=True)
 
@@ -151,3 +159,181 @@ def test_export_and_drive(run_dir, onnx, capsys):
     assert goals >= 0
     assert violations >= 0
     assert "20 steps" in capsys.readouterr().out
+
+
+class TestBesideATraining:
+    """A run that trains replaces what is being read."""
+
+    def rotate(self, run_dir):
+        """The newest checkpoint gives way to the next."""
+        old = checkpoints.latest(run_dir)
+        step = int(old.name.split("-")[1]) + 1
+        new = old.with_name(f"checkpoint-{step:012d}")
+        shutil.copytree(old, new)
+        shutil.rmtree(old)
+        return new
+
+    @pytest.mark.parametrize("times", [1, 3])
+    @pytest.mark.parametrize("command", ["evaluate", "export", "load_policy"])
+    def test_checkpoint_is_replaced_while_it_is_read(
+        self, run_dir, tmp_path, monkeypatch, times, command
+    ):
+        """Policy and critics are of one checkpoint, the newest that is there."""
+        run_dir = shutil.copytree(run_dir, tmp_path / "run")
+        load, left, used = checkpoints.SealedCheckpoint.load, [times], []
+
+        def late(self, path, **options):
+            if "config" not in self.components and left[0]:
+                left[0] -= 1
+                TestBesideATraining().rotate(run_dir)
+            used.append(path)
+            return load(self, path, **options)
+
+        monkeypatch.setattr(checkpoints.SealedCheckpoint, "load", late)
+        if command == "evaluate":
+            evaluate.main(run_dir, episodes=1, seed=5, film=False)
+        elif command == "export":
+            export.main(run_dir, onnx=False)
+        else:
+            load_policy(run_dir)
+        assert left == [0]
+        newest = checkpoints.latest(run_dir)
+        assert len({path for path in used if path == newest}) == 1
+        assert used[-2:] == [newest] * 2  # its configuration and policy, or policy and critics
+
+    def test_critics_are_of_the_policys_checkpoint(self, run_dir, tmp_path, monkeypatch):
+        """Gone between the two, both are read again."""
+        run_dir = shutil.copytree(run_dir, tmp_path / "run")
+        load, used = checkpoints.SealedCheckpoint.load, []
+
+        def late(self, path, **options):
+            if "cost_loss" in self.components and len(used) == 2:
+                TestBesideATraining().rotate(run_dir)
+            used.append((path.name, *self.components))
+            return load(self, path, **options)
+
+        monkeypatch.setattr(checkpoints.SealedCheckpoint, "load", late)
+        evaluate.main(run_dir, episodes=1, seed=5, film=False)
+        first, last = used[0][0], used[-1][0]
+        parts = ("config", "policy", "cost_loss")
+        assert used == [(name, part) for name in (first, last) for part in parts]
+        assert first != last
+
+    def test_checkpoint_that_is_broken_is_not_tried_for_ever(self, run_dir, tmp_path):
+        run_dir = shutil.copytree(run_dir, tmp_path / "run")
+        next(checkpoints.latest(run_dir).rglob("*-cost_loss/state/*.memmap")).unlink()
+        with pytest.raises(CheckpointError, match="is not what was written"):
+            evaluate.main(run_dir, episodes=1, seed=5, film=False)
+
+    def test_nobody_sees_half_a_file(self, run_dir, tmp_path):
+        """Everything that is written again and again, read as fast as one can."""
+        run_dir = shutil.copytree(run_dir, tmp_path / "run")
+        evaluate.main(run_dir, episodes=1, seed=5, film=False)
+        watch.look(run_dir)
+        out = run_dir / "evaluation"
+        ends = {
+            run_dir / "curves.png": b"IEND\xaeB`\x82",
+            out / "trajectories.png": b"IEND\xaeB`\x82",
+            out / "calibration.png": b"IEND\xaeB`\x82",
+            out / "results.json": b"}\n",
+            run_dir / "config.yaml": b"\n",
+        }
+        cfg = read_config(run_dir / "config.yaml")
+
+        def write():
+            for _ in range(2):
+                evaluate.main(run_dir, episodes=1, seed=5, film=False)
+                watch.look(run_dir)
+                write_config(run_dir / "config.yaml", cfg)
+
+        writer = threading.Thread(target=write)
+        writer.start()
+        reads = 0
+        while writer.is_alive():
+            for path, end in ends.items():
+                assert path.read_bytes().endswith(end), path
+            assert read_config(run_dir / "config.yaml") == cfg
+            reads += 1
+        writer.join()
+        assert reads > 10
+
+
+class TestNames:
+    def test_only_a_runs_own_names_count(self, run_dir, tmp_path):
+        """Copies under other names are neither the newest nor rivals of the newest."""
+        run_dir = shutil.copytree(run_dir, tmp_path / "run")
+        newest = checkpoints.latest(run_dir)
+        others = ["best", "old", "9", "99999", "0000000000009", "000000000900-copy", "٠" * 12, "²"]
+        for name in others:
+            shutil.copytree(newest, newest.with_name(f"checkpoint-{name}"))
+        shutil.copytree(newest, newest.with_name("my-checkpoint-000000000900"))
+        assert checkpoints.latest(run_dir) == newest
+        rotation = checkpoints.Rotation(run_dir, keep_last=1)
+        checkpoint = checkpoints.SealedCheckpoint(config=Configuration())
+        saved = rotation.save(checkpoint, step=801)
+        assert checkpoints.latest(run_dir) == saved
+        assert not newest.exists()
+        for name in others:
+            assert newest.with_name(f"checkpoint-{name}").exists()
+
+    def test_rotation_keeps_the_newest(self, tmp_path):
+        rotation = checkpoints.Rotation(tmp_path, keep_last=2)
+        for step in (1, 5, 3, 10**12, 7):
+            rotation.save(checkpoints.SealedCheckpoint(config=Configuration()), step=step)
+        names = sorted(path.name for path in (tmp_path / "checkpoints").iterdir())
+        assert names == ["checkpoint-000000000007", "checkpoint-1000000000000"]
+        assert checkpoints.latest(tmp_path).name == "checkpoint-1000000000000"
+
+    @pytest.mark.parametrize(
+        "command",
+        [
+            lambda path: evaluate.main(path, episodes=1, seed=5, film=False),
+            lambda path: watch.main(path, every=1.0, once=True),
+            lambda path: run_exported.load(export.main(path, onnx=False)),
+            load_policy,
+            load_run,
+        ],
+    )
+    def test_tilde_is_home(self, run_dir, tmp_path, monkeypatch, command):
+        home, here = tmp_path / "home", tmp_path / "here"
+        here.mkdir()
+        shutil.copytree(run_dir, home / "run")
+        monkeypatch.setenv("HOME", str(home))
+        monkeypatch.chdir(here)
+        command(Path("~/run"))
+        assert not list(here.iterdir())
+
+    def test_exported_file_at_home(self, run_dir, tmp_path, monkeypatch):
+        monkeypatch.setenv("HOME", str(tmp_path))
+        shutil.copy(export.main(run_dir, onnx=False), tmp_path)
+        run_exported.load(Path("~/policy.pt2"))
+
+
+def test_checkpoint_refuses_to_save_what_it_would_not_load(tmp_path):
+    state = SimpleNamespace(state_dict=lambda: {"a": {1, 2}}, load_state_dict=lambda _: None)
+    with pytest.raises(TypeError, match=r"the state of odd holds .*set"):
+        checkpoints.SealedCheckpoint(odd=state).save(tmp_path / "checkpoint")
+    assert not list(tmp_path.iterdir())
+
+
+def test_every_kind_of_state_comes_back(tmp_path):
+    saved = {
+        "plain": [1, 2.5, True, None, "text", float("inf")],
+        "nested": OrderedDict(a=(1, (2,)), b={"c": torch.Size([3, 4])}),
+        3: torch.arange(6).reshape(2, 3),
+        "empty": torch.empty(0, 4),
+        "bits": torch.tensor(2.5, dtype=torch.bfloat16),
+        "array": np.arange(3.0),
+    }
+    read = {}
+    source = SimpleNamespace(state_dict=lambda: saved, load_state_dict=None)
+    target = SimpleNamespace(state_dict=lambda: saved, load_state_dict=read.update)
+    checkpoints.SealedCheckpoint(x=source).save(tmp_path / "checkpoint")
+    checkpoints.load_components(tmp_path / "checkpoint", x=target)
+    assert read.keys() == saved.keys()
+    for name in ("plain", "nested"):
+        assert read[name] == saved[name]
+        assert type(read[name]) is type(saved[name])
+    for name in (3, "empty", "bits"):
+        torch.testing.assert_close(read[name], saved[name], rtol=0, atol=0)
+    np.testing.assert_array_equal(read["array"], saved["array"])

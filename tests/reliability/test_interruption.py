@@ -76,7 +76,7 @@ class TestFullDisk:
             calls = iter(range(10_000))
 
             def fsync(descriptor):
-                if next(calls) >= after + 1:  # the first is that of config.yaml
+                if next(calls) >= after + 2:  # the first are those of config.yaml and its folder
                     raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
             patch.setattr(os, "fsync", fsync)

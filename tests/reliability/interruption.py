@@ -2,9 +2,9 @@
 
     python tests/reliability/interruption.py --kills 100
 
-Every kill is a SIGINT, SIGTERM, SIGHUP or SIGKILL at a random moment between the start of a process and its
-end, half of them while a checkpoint is being written. After each one every checkpoint must be
-whole, no more than one interval may be lost, and a resumed process must go on and finish. In the
+Every kill is a SIGINT, SIGTERM, SIGHUP or SIGKILL at a random moment between the start of a process
+and its end, half of them while a checkpoint is being written. After each one every checkpoint must
+be whole, no more than one interval may be lost, and a resumed process must go on and finish. In the
 end, the log of the run must be that of a run that nobody killed, to the last bit.
 
 Processes are forked from one that has done the imports, which take longer than the run.

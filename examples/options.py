@@ -75,7 +75,7 @@ def settle(saved: DictConfig, cfg: DictConfig) -> tuple[DictConfig, dict[str, tu
     """
     old = dict(flat(OmegaConf.to_container(saved)))
     new = dict(flat(OmegaConf.to_container(cfg, resolve=True)))
-    again = given(cfg)
+    again = given(cfg) | {"script"}  # who starts another script says so
     settled = OmegaConf.create(OmegaConf.to_container(cfg, resolve=True))
     changed = {}
     for name, value in new.items():

@@ -13,6 +13,7 @@ from typing import Any
 
 import torch
 from omegaconf import DictConfig
+from streams import stream_seed
 from tensordict import TensorDict, TensorDictBase
 from torchrl.collectors import (
     BaseCollector,
@@ -90,7 +91,7 @@ def make_collector(
 
 def envs_per_batch(cfg: DictConfig) -> int:
     """How many environments a batch of :func:`make_collector` is of."""
-    shared = cfg.collector.backend == "multi_async"
+    shared = cfg.collector.get("backend") == "multi_async"
     return cfg.env.num_envs // (cfg.collector.num_workers if shared else 1)
 
 
@@ -223,8 +224,8 @@ def _ray_collector(
 
 
 def worker_seed(seed: int, worker: int) -> int:
-    """Seed of a worker's environments and draws; that of the first is the run's own."""
-    return seed + 7_919 * worker
+    """Seed of a worker's environments and draws."""
+    return stream_seed("worker", seed, worker)
 
 
 def _in_worker(make_env: Callable[..., EnvBase], num_envs: int, seed: int) -> EnvBase:

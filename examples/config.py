@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 import difflib
-import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from importlib.util import find_spec
 from numbers import Real
+from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
 import torch
 from collectors import BACKENDS
 from omegaconf import DictConfig, OmegaConf
+from options import flat
 from policy_steps import DISTANCES
 
 from torchrl_safe.envs import RANDOMIZATIONS, ROBOTS
+
+LARGEST = float(np.finfo(np.float32).max)
 
 
 class Rule(NamedTuple):
@@ -24,16 +28,16 @@ class Rule(NamedTuple):
     text: str
 
 
-def integer(low: int) -> Rule:
-    """A whole number of at least ``low``."""
+def integer(low: int, high: int = 2**31 - 1) -> Rule:
+    """A whole number between ``low`` and ``high``, by default the largest that C's int holds."""
     return Rule(
-        lambda v: isinstance(v, int) and not isinstance(v, bool) and v >= low,
-        f"an integer of at least {low}",
+        lambda v: isinstance(v, int) and not isinstance(v, bool) and low <= v <= high,
+        f"an integer of at least {low} and at most {high}",
     )
 
 
 def number(interval: str) -> Rule:
-    """A finite number in an interval such as ``[0, 1)`` or ``(0, inf)``."""
+    """A finite number in an interval such as ``[0, 1)`` or ``(0, inf)``, in single precision."""
     low, high = (float(end) for end in interval[1:-1].split(","))
     above = float.__gt__ if interval[0] == "(" else float.__ge__
     below = float.__lt__ if interval[-1] == ")" else float.__le__
@@ -41,8 +45,10 @@ def number(interval: str) -> Rule:
     def holds(value: Any) -> bool:
         if not isinstance(value, Real) or isinstance(value, bool):
             return False
-        value = float(value)
-        return math.isfinite(value) and above(value, low) and below(value, high)
+        if not abs(value) <= LARGEST:
+            return False
+        value = float(np.float32(value))  # as networks will have it: 1 - 1e-9 is 1
+        return above(value, low) and below(value, high)
 
     return Rule(holds, f"a number in {interval}")
 
@@ -112,12 +118,15 @@ BOOLEAN = Rule(lambda v: isinstance(v, bool), "one of True, False")  # 1 == True
 PATH = Rule(lambda v: isinstance(v, str) and v != "", "a path")
 NAME = Rule(lambda v: isinstance(v, str) and v != "", "a name")
 
+FRAMES = 2**63 - 1  # what a counter of frames holds
+
 EXTRAS = ("tensorboard", "wandb", "ray")  # packages that bear the name of the extra
 
 RULES: dict[str, Rule] = {
-    "seed": integer(0),
+    "seed": integer(0, 2**64 - 1),
     "num_threads": integer(1),
     "device": device(),
+    "script": one_of(*sorted(file.stem for file in Path(__file__).parent.glob("*.yaml"))),
     "run_dir": PATH,
     "resume": BOOLEAN,
     "update": one_of("trust_region", "lagrangian", "pid"),
@@ -132,8 +141,8 @@ RULES: dict[str, Rule] = {
     "collector.backend": one_of(*BACKENDS),
     "collector.num_workers": integer(1),
     "collector.frames_per_batch": integer(1),
-    "collector.total_frames": integer(1),
-    "collector.init_frames": integer(0),
+    "collector.total_frames": integer(1, FRAMES),
+    "collector.init_frames": integer(0, FRAMES),
     "replay_buffer.storage": one_of("memory", "memmap"),
     "replay_buffer.size": integer(1),
     "replay_buffer.slice_len": integer(1),
@@ -159,7 +168,7 @@ RULES: dict[str, Rule] = {
     "loss.risk_level": number("(0, 1]"),
     "loss.cost_limit": number("[0, inf)"),
     "loss.initial_cost_limit": number("[0, inf)"),
-    "loss.anneal_frames": integer(0),
+    "loss.anneal_frames": integer(0, FRAMES),
     "loss.variance_reward": one_of("td_error", "second_moment"),
     "loss.clip_epsilon": number("(0, 1)"),
     "loss.entropy_coeff": number("[0, inf)"),
@@ -194,12 +203,12 @@ RULES: dict[str, Rule] = {
     "optim.recovery_ratio": number("(0, 1]"),
     "logger.backend": one_of("csv", "tensorboard", "wandb", ""),
     "logger.project_name": NAME,
-    "eval.interval": integer(1),
+    "eval.interval": integer(1, FRAMES),
     "eval.num_episodes": integer(1),
     "eval.final_episodes": integer(1),
     "eval.num_directions": integer(1),
     "eval.num_steps": integer(1),
-    "checkpoint.interval": integer(1),
+    "checkpoint.interval": integer(1, FRAMES),
     "checkpoint.keep_last": integer(1),
     "video.num_steps": integer(0),
 }
@@ -231,16 +240,26 @@ def check_options(cfg: DictConfig) -> dict[str, Any]:
     Raises:
         ValueError: if an option is unknown, its value is impossible, or two do not go together.
     """
-    options = dict(_flat(OmegaConf.to_container(cfg, resolve=True)))
+    options = dict(flat(OmegaConf.to_container(cfg, resolve=True)))
     for name, value in options.items():
         if name not in RULES:
             close = difflib.get_close_matches(name, RULES) or sorted(RULES)
             raise ValueError(f"{name} is not an option; there are {', '.join(close)}.")
         rule = RULES[name]
         if not rule.holds(value):
-            raise ValueError(f"{name} must be {rule.text}, got {value!r}.")
+            raise ValueError(f"{name} must be {rule.text}, got {_shown(value)}.")
     _check_together(options)
     return options
+
+
+def _shown(value: Any) -> str:
+    """A value as it was written, and where it differs visibly, as networks will have it."""
+    if not isinstance(value, float):
+        return repr(value)
+    with np.errstate(over="ignore", under="ignore"):
+        single = np.float32(value)
+    rounded = value not in (0, 1) and single in (0, 1, np.inf, -np.inf) and abs(value) < np.inf
+    return f"{value!r}, which is {single} in single precision" if rounded else repr(value)
 
 
 def _check_together(options: Mapping[str, Any]) -> None:
@@ -250,8 +269,10 @@ def _check_together(options: Mapping[str, Any]) -> None:
             "replay_buffer.storage=memmap keeps the replay on the CPU, so that device must be cpu, "
             f"got {options['device']!r}."
         )
+    workers = options.get("collector.backend", "single") != "single"
     for name, divisor in (
         ("collector.frames_per_batch", "env.num_envs"),
+        *((("env.num_envs", "collector.num_workers"),) if workers else ()),
         ("optim.critic_frames", "replay_buffer.slice_len"),
         ("replay_buffer.batch_size", "replay_buffer.slice_len"),
     ):
@@ -259,6 +280,8 @@ def _check_together(options: Mapping[str, Any]) -> None:
             raise ValueError(
                 f"{name} must be a multiple of {divisor}={options[divisor]}, got {options[name]}."
             )
+    if {"replay_buffer.slice_len", "env.num_envs"} <= options.keys():
+        _check_slices(options)
     for name, ceiling in (
         ("replay_buffer.slice_len", "env.episode_length"),
         ("collector.frames_per_batch", "replay_buffer.size"),
@@ -270,9 +293,19 @@ def _check_together(options: Mapping[str, Any]) -> None:
             )
 
 
-def _flat(options: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    for name, value in options.items():
-        if isinstance(value, Mapping):
-            yield from _flat(value, f"{prefix}{name}.")
-        else:
-            yield prefix + name, value
+def _check_slices(options: Mapping[str, Any]) -> None:
+    """The first update replays slices of trajectories that must be there by then."""
+    frames, slice_len = options["collector.frames_per_batch"], options["replay_buffer.slice_len"]
+    num_envs = options["env.num_envs"]
+    batches = max(1, -(-options["collector.init_frames"] // frames))
+    if options["collector.backend"] == "multi_async":  # the next batch is another worker's
+        num_envs, batches = num_envs // options["collector.num_workers"], 1
+    steps = frames // num_envs
+    if steps < 2 or batches * steps < slice_len:
+        least = num_envs * max(2, -(-slice_len // batches))
+        raise ValueError(
+            f"collector.frames_per_batch must be at least {least}, got {frames}: {num_envs} "
+            f"environments must take {slice_len} steps (replay_buffer.slice_len), and 2 in every "
+            f"batch, before the first update at collector.init_frames="
+            f"{options['collector.init_frames']}."
+        )

@@ -10,12 +10,14 @@ from __future__ import annotations
 import hydra
 from omegaconf import DictConfig
 from trc import run_trc
+from utils import Run
 
 
 @hydra.main(config_path=".", config_name="cpo", version_base="1.3")
 def main(cfg: DictConfig) -> None:
     """CPO as configured in cpo.yaml."""
-    run_trc(cfg)
+    with Run(cfg) as run:
+        run_trc(run)
 
 
 if __name__ == "__main__":

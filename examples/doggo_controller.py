@@ -21,15 +21,16 @@ import torch
 from collectors import ResumableCollector
 from omegaconf import DictConfig
 from safetensors.torch import save_file
+from streams import stream_seed
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule
+from terminal import GracefulStop, progress_bar, say
 from torch import nn
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.modules import MLP, ProbabilisticActor, TanhNormal, ValueOperator
 from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
-from tqdm import tqdm, trange
-from utils import EVAL_SEED, GracefulStop, Run, set_up
+from utils import Run, set_up
 from walking import Walking
 
 from torchrl_safe.envs import SafeGoalEnv
@@ -146,10 +147,13 @@ def find_gait(cfg: DictConfig) -> torch.Tensor:
     mean = torch.zeros(6, 6)
     for stage in cfg.gait:
         population, ways = stage.population, stage.num_directions
-        env = make_env(cfg, population * ways, EVAL_SEED, num_directions=ways)
+        seed = stream_seed("gait", cfg.seed)
+        env = make_env(cfg, population * ways, seed, num_directions=ways)
         std = torch.tensor(stage.std).repeat_interleave(3).expand(6, 6)  # of ahead, of turn
-        progress = trange(stage.generations, desc=f"gait, {ways} directions", unit="generation")
-        for _ in progress:
+        progress = progress_bar(
+            total=stage.generations, desc=f"gait, {ways} directions", unit="generation"
+        )
+        for _ in range(stage.generations):
             candidates = mean + std * torch.randn(population, 6, 6)
             candidates[0] = mean
             actor = make_actor(make_legs(cfg, candidates))
@@ -159,7 +163,9 @@ def find_gait(cfg: DictConfig) -> torch.Tensor:
             best = (worth.mean(1) + worth.min(1).values).topk(stage.elites).indices
             mean, std = candidates[best].mean(0), candidates[best].std(0)
             speed = speed.view(population, ways)[best].mean().item()
+            progress.update()
             progress.set_postfix(speed=f"{speed:.3f}", fallen=f"{fallen.float().mean().item():.3f}")
+        progress.close()
     return mean
 
 
@@ -173,12 +179,12 @@ def export(legs: Legs, path: Path) -> None:
     save_file(tensors, path, metadata={"command": command})
 
 
-@hydra.main(config_path=".", config_name="doggo_controller", version_base="1.3")
-def main(cfg: DictConfig) -> None:
+def run_doggo(run: Run) -> None:
     """Find a gait, train, measure and export a controller."""
+    cfg = run.cfg
     set_up(cfg)
     # A checkpoint brings its own gait.
-    legs = make_legs(cfg, torch.zeros(6, 6) if cfg.resume else find_gait(cfg))
+    legs = make_legs(cfg, find_gait(cfg) if run.begins else torch.zeros(6, 6))
     actor = make_actor(legs)
     critic = ValueOperator(
         MLP(INPUT_SIZE, 1, num_cells=list(cfg.critic.num_cells), activation_class=nn.Tanh),
@@ -194,42 +200,45 @@ def main(cfg: DictConfig) -> None:
     )
     advantage = GAE(gamma=cfg.loss.gamma, lmbda=cfg.loss.lmbda, value_network=critic)
     optim = torch.optim.Adam(loss.parameters(), lr=cfg.optim.lr)
-    run = Run(cfg, loss=loss, optim=optim)
     collector = ResumableCollector(
         make_env(
             cfg,
             cfg.env.num_envs,
-            cfg.seed,
+            stream_seed("training", cfg.seed, 0),
             episode_length=cfg.env.episode_length,
             stagger=True,
         ),
         actor,
         frames_per_batch=cfg.collector.frames_per_batch,
-        total_frames=cfg.collector.total_frames - run.frames,
+        total_frames=cfg.collector.total_frames,
         exploration_type=ExplorationType.RANDOM,
         auto_register_policy_transforms=False,
     )
-    run.start(collector=collector)
-    if not cfg.resume:
+    begins = run.begins
+    run.restore(loss=loss, optim=optim, collector=collector)
+    if begins:
         export(legs, run.path / "gait.safetensors")  # to compare with
 
     total = cfg.collector.total_frames
-    progress = tqdm(total=total, initial=run.frames, unit="frame")
+    progress = progress_bar(total=total, initial=run.frames, unit="frame")
     intervals = (cfg.eval.interval, cfg.checkpoint.interval)
     next_eval, next_save = (run.frames // each * each + each for each in intervals)
     eval_env = make_env(
-        cfg, cfg.eval.num_directions, EVAL_SEED, num_directions=cfg.eval.num_directions
+        cfg,
+        cfg.eval.num_directions,
+        stream_seed("evaluation"),
+        num_directions=cfg.eval.num_directions,
     )
     started = time.perf_counter()
     with GracefulStop() as stop:
-        for batch in collector:
+        for batch in collector if run.frames_left else ():
+            # Steps get smaller towards the end.
+            for group in optim.param_groups:
+                group["lr"] = cfg.optim.lr * max(1.0 - run.frames / total, 0.1)
             run.counters["frames"] += batch.numel()
             run.counters["instabilities"] += int(batch["next", "diverged"].sum())
             metrics = update(cfg, batch, loss, advantage, optim)
             metrics["train/instabilities"] = run.counters["instabilities"]
-            # Steps get smaller towards the end.
-            for group in optim.param_groups:
-                group["lr"] = cfg.optim.lr * max(1.0 - run.frames / total, 0.1)
             if run.frames >= next_eval:
                 next_eval += cfg.eval.interval
                 metrics |= evaluate(cfg, actor, eval_env)
@@ -252,11 +261,11 @@ def main(cfg: DictConfig) -> None:
         run.save()
     collector.shutdown()
     if stop.requested:
-        print(f"stopped at {run.frames} frames; go on with the same command and resume=true")
+        say(f"stopped at {run.frames} frames; go on with the same command and resume=true")
         return
     export(legs, run.path / "legs.safetensors")
-    print(format_table(evaluate(cfg, actor, eval_env)))
-    print(f"controller: {run.path / 'legs.safetensors'}")
+    say(format_table(evaluate(cfg, actor, eval_env)))
+    say(f"controller: {run.path / 'legs.safetensors'}")
 
 
 def update(
@@ -295,6 +304,13 @@ def evaluate(cfg: DictConfig, actor: ProbabilisticActor, env: SafeGoalEnv) -> di
         "eval/slowest": speed.min().item(),
         "eval/fallen": fallen.float().mean().item(),
     }
+
+
+@hydra.main(config_path=".", config_name="doggo_controller", version_base="1.3")
+def main(cfg: DictConfig) -> None:
+    """Doggo's controller as configured in doggo_controller.yaml."""
+    with Run(cfg) as run:
+        run_doggo(run)
 
 
 if __name__ == "__main__":

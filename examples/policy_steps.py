@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import torch
 from descent import Descent
 from omegaconf import DictConfig
+from options import settings_of
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
@@ -125,7 +126,9 @@ class Multiplier:
         """Put both back."""
         self.module.load_state_dict(state["module"])
         if self.optim is not None:
+            put_back = settings_of(self.optim)
             self.optim.load_state_dict(state["optim"])
+            put_back()
 
 
 def ascend(

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import csv
 import time
+from contextlib import closing
 from functools import partial
 from pathlib import Path
 
@@ -19,9 +20,12 @@ import hydra
 import torch
 from config import check_config
 from descent import Descent
+from locks import FolderLock
 from omegaconf import DictConfig, OmegaConf
+from streams import stream_seed
 from tensordict import TensorDictBase
 from tensordict.nn import NormalParamExtractor, TensorDictModule
+from terminal import progress_bar
 from torch import Tensor, nn
 from torchrl._utils import logger as torchrl_logger
 from torchrl.collectors import Collector
@@ -30,9 +34,9 @@ from torchrl.envs import Compose, DoubleToFloat, EnvBase, GymEnv, RewardSum, Tra
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.modules import MLP, ProbabilisticActor, TanhNormal, ValueOperator
 from torchrl.objectives import SACLoss, SoftUpdate
-from tqdm import tqdm
 
 from torchrl_safe import RetraceEstimator
+from torchrl_safe._files import write_atomically
 
 COLUMNS = ("frames", "seconds", "eval_return", "train_return", "alpha", "loss_qvalue", "trace")
 
@@ -83,10 +87,21 @@ def mean_trace(actor: ProbabilisticActor, batch: TensorDictBase) -> Tensor:
 def main(cfg: DictConfig) -> None:
     """Train an agent and write its learning curve."""
     check_config(cfg)
+    run_dir = Path(cfg.run_dir).expanduser()
+    run_dir.mkdir(parents=True, exist_ok=True)
+    with closing(FolderLock(run_dir)):
+        if (run_dir / "config.yaml").exists():
+            raise FileExistsError(f"run_dir={run_dir} holds a run already: choose another one.")
+        run_retrace_sac(cfg, run_dir)
+
+
+def run_retrace_sac(cfg: DictConfig, run_dir: Path) -> None:
+    """The run itself, in a folder that is its own."""
     torchrl_logger.setLevel("WARNING")  # its notes would break the progress bar
     torch.set_num_threads(1)
-    torch.manual_seed(cfg.seed)
-    env, eval_env = make_env(cfg.env.name, cfg.seed), make_env(cfg.env.name, cfg.seed + 1000)
+    torch.manual_seed(stream_seed("networks", cfg.seed))
+    env = make_env(cfg.env.name, stream_seed("training", cfg.seed, 0))
+    eval_env = make_env(cfg.env.name, stream_seed("evaluation"))
     actor, critic = make_networks(env, cfg.network.num_cells)
 
     loss = SACLoss(actor, critic, alpha_init=cfg.loss.alpha_init, action_spec=env.action_spec)
@@ -118,12 +133,10 @@ def main(cfg: DictConfig) -> None:
         auto_register_policy_transforms=False,
     )
 
-    run_dir = Path(cfg.run_dir)
-    run_dir.mkdir(parents=True, exist_ok=True)
-    OmegaConf.save(cfg, run_dir / "config.yaml", resolve=True)
+    write_atomically(run_dir / "config.yaml", OmegaConf.to_yaml(cfg, resolve=True))
     updates = round(cfg.optim.updates_per_frame * cfg.collector.frames_per_batch)
     frames, started = 0, time.perf_counter()
-    progress = tqdm(total=cfg.collector.total_frames, unit="frame")
+    progress = progress_bar(total=cfg.collector.total_frames, unit="frame")
     with open(run_dir / "curves.csv", "w", newline="") as file:
         writer = csv.DictWriter(file, COLUMNS)
         writer.writeheader()

@@ -10,13 +10,15 @@ from __future__ import annotations
 
 import hydra
 from omegaconf import DictConfig
+from utils import Run
 from wcsac import run_wcsac
 
 
 @hydra.main(config_path=".", config_name="sac_lagrangian", version_base="1.3")
 def main(cfg: DictConfig) -> None:
     """SAC-Lagrangian as configured in sac_lagrangian.yaml."""
-    run_wcsac(cfg)
+    with Run(cfg) as run:
+        run_wcsac(run)
 
 
 if __name__ == "__main__":

@@ -34,7 +34,7 @@ from policy_steps import (
 )
 from tensordict import TensorDict, TensorDictBase
 from torchrl._utils import timeit
-from utils import EVAL_SEED, Run, make_env, make_policy, set_up, train
+from utils import Run, make_eval_env, make_policy, set_up, train
 
 from torchrl_safe import CVaRCostLoss, GMMTanhPolicy, TsallisLoss
 
@@ -80,11 +80,11 @@ def policy_closure(
     return closure
 
 
-@hydra.main(config_path=".", config_name="safetac_point", version_base="1.3")
-def main(cfg: DictConfig) -> None:
+def run_safetac(run: Run) -> None:
     """Train, evaluate and film an agent."""
+    cfg = run.cfg
     set_up(cfg)
-    eval_env = make_env(cfg, cfg.eval.num_episodes, EVAL_SEED)
+    eval_env = make_eval_env(cfg)
 
     # The blocks: a policy, critics of reward and cost, and the trust region.
     policy = make_policy(cfg, eval_env)
@@ -102,8 +102,7 @@ def main(cfg: DictConfig) -> None:
         )
         descent = Descent(cfg, policy_optim)
         components["multiplier"] = multiplier = Multiplier(cfg, cfg["update"])
-    run = Run(
-        cfg,
+    run.register(
         reward_loss=reward_loss,
         cost_loss=cost_loss,
         critic_optim=critic_optim,
@@ -145,6 +144,13 @@ def main(cfg: DictConfig) -> None:
         return {**metrics, "update/constraint": level.item(), "update/cost_limit": limit}
 
     train(run, policy, update, eval_env)
+
+
+@hydra.main(config_path=".", config_name="safetac_point", version_base="1.3")
+def main(cfg: DictConfig) -> None:
+    """SafeTAC as configured in safetac_point.yaml."""
+    with Run(cfg) as run:
+        run_safetac(run)
 
 
 if __name__ == "__main__":

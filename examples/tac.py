@@ -17,16 +17,16 @@ from tensordict import TensorDictBase
 from torchrl._utils import timeit
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.objectives import SoftUpdate
-from utils import EVAL_SEED, Run, make_critic, make_env, make_policy, set_up, train
+from utils import Run, make_critic, make_eval_env, make_policy, set_up, train
 
 from torchrl_safe import TsallisLoss
 
 
-@hydra.main(config_path=".", config_name="tac", version_base="1.3")
-def main(cfg: DictConfig) -> None:
+def run_tac(run: Run) -> None:
     """Train, evaluate and film an agent."""
+    cfg = run.cfg
     set_up(cfg)
-    eval_env = make_env(cfg, cfg.eval.num_episodes, EVAL_SEED)
+    eval_env = make_eval_env(cfg)
     policy = make_policy(cfg, eval_env)
     loss = TsallisLoss(
         policy,
@@ -43,7 +43,7 @@ def main(cfg: DictConfig) -> None:
         storage=LazyTensorStorage(cfg.replay_buffer.size, device=cfg.device),
         batch_size=cfg.optim.minibatch_size,
     )
-    run = Run(cfg, loss=loss, optim=optim, buffer=buffer)
+    run.register(loss=loss, optim=optim, buffer=buffer)
 
     def update(batch: TensorDictBase) -> dict[str, float]:
         """Gradient steps on replayed transitions."""
@@ -59,6 +59,13 @@ def main(cfg: DictConfig) -> None:
         return metrics | {"update/skipped_steps": descent.count()}
 
     train(run, policy, update, eval_env)
+
+
+@hydra.main(config_path=".", config_name="tac", version_base="1.3")
+def main(cfg: DictConfig) -> None:
+    """Tsallis actor-critic as configured in tac.yaml."""
+    with Run(cfg) as run:
+        run_tac(run)
 
 
 if __name__ == "__main__":

@@ -15,19 +15,19 @@ from policy_steps import cost_limit_at, make_trust_region
 from surrogates import fit_critics, make_surrogates, policy_step, with_advantages
 from tensordict import TensorDictBase
 from torchrl._utils import timeit
-from utils import EVAL_SEED, Run, make_env, make_policy, set_up, train
+from utils import Run, make_eval_env, make_policy, set_up, train
 
 
-def run_trc(cfg: DictConfig) -> None:
+def run_trc(run: Run) -> None:
     """Train, evaluate and film an agent; at ``risk_level=1`` the algorithm is CPO."""
+    cfg = run.cfg
     set_up(cfg)
-    eval_env = make_env(cfg, cfg.eval.num_episodes, EVAL_SEED)
+    eval_env = make_eval_env(cfg)
     policy = make_policy(cfg, eval_env)
     reward_loss, cost_loss, critic_optim = make_surrogates(cfg, eval_env)
     descent = Descent(cfg, critic_optim)
     policy_optim = make_trust_region(cfg, policy)
-    run = Run(
-        cfg,
+    run.register(
         reward_loss=reward_loss,
         cost_loss=cost_loss,
         critic_optim=critic_optim,
@@ -52,7 +52,8 @@ def run_trc(cfg: DictConfig) -> None:
 @hydra.main(config_path=".", config_name="trc", version_base="1.3")
 def main(cfg: DictConfig) -> None:
     """TRC as configured in trc.yaml."""
-    run_trc(cfg)
+    with Run(cfg) as run:
+        run_trc(run)
 
 
 if __name__ == "__main__":

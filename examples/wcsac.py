@@ -19,17 +19,18 @@ from torch import nn
 from torchrl._utils import timeit
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.objectives import SoftUpdate, ValueEstimators
-from utils import EVAL_SEED, Run, make_critic, make_env, make_policy, set_up, train
+from utils import Run, make_critic, make_eval_env, make_policy, set_up, train
 
 from torchrl_safe import CVaRCostLoss, TsallisLoss
 from torchrl_safe.objectives import lagrangian
 from torchrl_safe.objectives.functional import q_logarithm
 
 
-def run_wcsac(cfg: DictConfig) -> None:
+def run_wcsac(run: Run) -> None:
     """Train, evaluate and film an agent; at ``risk_level=1`` the algorithm is SAC-Lagrangian."""
+    cfg = run.cfg
     set_up(cfg)
-    eval_env = make_env(cfg, cfg.eval.num_episodes, EVAL_SEED)
+    eval_env = make_eval_env(cfg)
     policy = make_policy(cfg, eval_env)
     reward_loss = TsallisLoss(
         policy,
@@ -59,8 +60,7 @@ def run_wcsac(cfg: DictConfig) -> None:
         storage=LazyTensorStorage(cfg.replay_buffer.size, device=cfg.device),
         batch_size=cfg.optim.minibatch_size,
     )
-    run = Run(
-        cfg,
+    run.register(
         reward_loss=reward_loss,
         cost_loss=cost_loss,
         optim=optim,
@@ -109,7 +109,8 @@ def run_wcsac(cfg: DictConfig) -> None:
 @hydra.main(config_path=".", config_name="wcsac", version_base="1.3")
 def main(cfg: DictConfig) -> None:
     """WCSAC as configured in wcsac.yaml."""
-    run_wcsac(cfg)
+    with Run(cfg) as run:
+        run_wcsac(run)
 
 
 if __name__ == "__main__":

@@ -53,12 +53,23 @@ class TestEveryConfiguration:
 @pytest.mark.parametrize(
     ("name", "value", "message"),
     [
-        ("seed", -1, "seed must be an integer of at least 0, got -1"),
-        ("seed", True, "seed must be an integer of at least 0, got True"),
+        ("seed", -1, "seed must be an integer of at least 0 and at most .*, got -1"),
+        ("seed", 2**70, "seed must be an integer of .* at most 18446744073709551615, got 118059"),
+        ("seed", True, "seed must be an integer of .*, got True"),
         ("device", "cuda:99", r"device must be one of 'cpu'.*got 'cuda:99'"),
-        ("num_threads", 1.5, "num_threads must be an integer of at least 1, got 1.5"),
+        (
+            "num_threads",
+            1.5,
+            "num_threads must be an integer of .* at most 2147483647, got 1.5",
+        ),
         ("env.robot", "unicycle", "env.robot must be one of 'point'.*got 'unicycle'"),
         ("loss.risk_level", 2, r"loss.risk_level must be a number in \(0, 1\], got 2"),
+        ("num_threads", 2**31, "num_threads must be an integer .*, got 2147483648"),
+        ("loss.cost_limit", 1e300, r"loss.cost_limit must be a number in .* got 1e\+300"),
+        ("loss.alpha", 1e-60, r"loss.alpha must be .*, got 1e-60, which is 0.0 in single"),
+        ("loss.gamma", 1 - 1e-9, "loss.gamma must be .* which is 1.0 in single precision"),
+        ("policy.log_std_bounds", [-4, 1e300], "policy.log_std_bounds must be two finite"),
+        ("script", "other", "script must be one of 'base', .*got 'other'"),
         ("loss.gamma", 1.0, r"loss.gamma must be a number in \[0, 1\), got 1.0"),
         ("loss.gamma", "high", "loss.gamma must be a number.*got 'high'"),
         ("loss.cost_limit", float("nan"), r"loss.cost_limit must be a number in \[0, inf\)"),
@@ -72,6 +83,8 @@ class TestEveryConfiguration:
         ("collector.frames_per_batch", 8001, "must be a multiple of env.num_envs=400, got 8001"),
         ("optim.critic_frames", 15_001, "must be a multiple of replay_buffer.slice_len=20"),
         ("env.episode_length", 10, "slice_len must be at most env.episode_length=10, got 20"),
+        ("collector.frames_per_batch", 400, "frames_per_batch must be at least 800, got 400"),
+        ("collector.init_frames", 0, "frames_per_batch must be at least 8400, got 8000.*slice_len"),
         ("replay_buffer.size", 800, "frames_per_batch must be at most replay_buffer.size=800"),
     ],
 )
@@ -79,6 +92,9 @@ def test_message(name, value, message):
     cfg = compose("safetac_point")
     with open_dict(cfg):
         OmegaConf.update(cfg, name, value)
+        if name == "collector.init_frames":
+            cfg.replay_buffer.slice_len = 21
+            cfg.optim.critic_frames = 21 * 700
     with pytest.raises(ValueError, match=message):
         config.check_config(cfg)
 
@@ -113,3 +129,10 @@ def test_missing_extra(monkeypatch, option, backend):
 )
 def test_distance_of_a_robot(overrides, distance):
     assert choose_distance(compose("safetac_point", *overrides)) is distance
+
+
+def test_workers_must_share_the_environments():
+    options = ["collector.backend=multi_sync", "collector.num_workers=3"]
+    with pytest.raises(ValueError, match=r"env.num_envs must be a multiple of .*num_workers=3"):
+        config.check_config(compose("safetac_point", *options))
+    config.check_config(compose("safetac_point", options[1]))  # nobody asks for them

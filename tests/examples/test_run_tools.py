@@ -22,6 +22,7 @@ import torch
 import watch
 from omegaconf import OmegaConf
 from saved import Configuration, read_config, write_config
+from streams import stream_seed
 from tensordict import TensorDict
 from test_safetac_point import launch
 from torchrl.checkpoint import CheckpointError
@@ -54,7 +55,7 @@ class TestLoadPolicy:
             policy,
             num_steps=30,
             exploration_type=ExplorationType.DETERMINISTIC,
-            seed=1_000_003,
+            seed=stream_seed("final evaluation"),
         )
         results = json.loads((run_dir / "results.json").read_text())
         assert played["episode_return"].mean().item() == results["eval/det/return"]
@@ -81,7 +82,15 @@ def test_evaluate(run_dir, capsys):
     out = run_dir / "evaluation"
     for name in ("trajectories.png", "calibration.png"):
         assert (out / name).stat().st_size > 5_000
-    assert json.loads((out / "results.json").read_text()).keys() == metrics.keys()
+    written = json.loads((out / "results.json").read_text(), parse_constant=pytest.fail)
+    episodes = written.pop("episodes")
+    assert written.keys() == metrics.keys()
+    for prefix, played in episodes.items():
+        assert len(played) == 4
+        for name in ("return", "cost", "violations", "entries", "discounted_cost", "length"):
+            mean = sum(episode[name] for episode in played) / 4
+            assert mean == pytest.approx(metrics[prefix + name])
+        assert {episode["end"] for episode in played} <= {"running", "truncated"}
     for prefix in ("det/", "sampled/"):
         for name in ("score", "score_low", "cv_rate", "success_rate", "failure_rate_high"):
             assert prefix + name in metrics
@@ -103,9 +112,10 @@ def test_evaluation_on_another_robot(run_dir):
     nominal = evaluate.main(run_dir, episodes=2, seed=5, film=False)
     other = evaluate.main(run_dir, episodes=2, seed=5, film=False, randomization="jackal_real")
     assert nominal["det/return"] != other["det/return"]
-    written = json.loads((run_dir / "evaluation_jackal_real" / "results.json").read_text())
-    assert written == other
-    assert json.loads((run_dir / "evaluation" / "results.json").read_text()) == nominal
+    for folder, metrics in (("evaluation_jackal_real", other), ("evaluation", nominal)):
+        written = json.loads((run_dir / folder / "results.json").read_text())
+        del written["episodes"]
+        assert written == metrics
 
 
 def test_watch(run_dir, capsys):

@@ -11,6 +11,7 @@ import sys
 from pathlib import Path
 
 import hydra
+import logs
 import numpy as np
 import pytest
 import safetac_point
@@ -104,17 +105,17 @@ class TestRun:
 
     def test_what_is_logged_is_not_kept(self, tmp_path, monkeypatch):
         """TorchRL's csv logger remembers every value of a run: memory grew with its length."""
-        runs = []
+        made = []
 
-        class Run(utils.Run):
+        class Logger(logs.CSVLogger):
             def __init__(self, *args, **kwargs):
                 super().__init__(*args, **kwargs)
-                runs.append(self)
+                made.append(self)
 
-        monkeypatch.setattr(safetac_point, "Run", Run)
+        monkeypatch.setattr(logs, "CSVLogger", Logger)
         launch(tmp_path / "run", "collector.total_frames=800")
         assert len(record.read_metrics(tmp_path / "run" / "log")["train/entropy"][0]) == 2
-        assert not runs[0].logger.experiment.scalars
+        assert not made[0].experiment.scalars
 
     def test_same_seed_same_metrics(self, finished, tmp_path, capsys):
         again = tmp_path / "again"
@@ -131,9 +132,15 @@ class TestRun:
                     first[name][1], second[name][1], rtol=0, atol=0, equal_nan=True, msg=name
                 )
 
-    def test_nothing_left_to_do(self, finished):
-        with pytest.raises(ValueError, match="total_frames=1600 leaves nothing to do"):
-            launch(finished, "collector.total_frames=1600", "resume=true")
+    def test_nothing_left_to_do(self, finished, capsys):
+        """A sweep that is started again passes over the runs that it has finished."""
+        before = {file: file.read_bytes() for file in finished.rglob("*") if file.is_file()}
+        launch(finished, "collector.total_frames=1600", "resume=true")
+        assert "total_frames=1600 leaves nothing to do" in capsys.readouterr().out
+        after = {file: file.read_bytes() for file in finished.rglob("*") if file.is_file()}
+        assert before.pop(finished / ".lock")
+        assert after.pop(finished / ".lock")
+        assert after == before
 
     def test_refuses_to_mix_runs(self, finished):
         before = (finished / "results.json").read_bytes()

@@ -16,6 +16,7 @@ from torchrl_safe.record import (
     batch_metrics,
     bootstrap_interval,
     count_violations,
+    describe,
     evaluate,
     proportion_interval,
     score,
@@ -118,18 +119,28 @@ def noisy_policy(td: TensorDictBase) -> TensorDictBase:
 
 
 def brute_force(script: dict[str, torch.Tensor], n: int, num_steps: int, action: float) -> dict:
-    total, cost, cv, goals, length = 0.0, 0.0, 0, 0, 0
+    total, cost, discounted, cv, entries, goals, length = 0.0, 0.0, 0.0, 0, 0, 0, 0
+    terminated = truncated = before = False
     for t in range(num_steps):
         total += script["reward"][t, n].item() + action
         cost += script["cost"][t, n].item()
+        discounted += 0.9**t * script["cost"][t, n].item()
+        entries += int(script["violation"][t, n].item() and not before)
+        before = script["violation"][t, n].item()
         cv += int(script["violation"][t, n].item())
         goals += int(script["goal_met"][t, n].item())
         length += 1
-        if script["terminated"][t, n] or script["truncated"][t, n]:
+        terminated, truncated = (script[name][t, n].item() for name in ("terminated", "truncated"))
+        if terminated or truncated:
             break
     return {
         "episode_return": total,
         "violations": cv,
+        "entries": entries,
+        "cost": cost,
+        "discounted_cost": discounted,
+        "terminated": terminated,
+        "truncated": truncated,
         "cv_rate": cv / length,
         "score": total / (1 + cv),
         "cost_rate": cost / length,
@@ -163,13 +174,23 @@ def test_evaluate_against_brute_force(num_steps):
         constant_policy(0.25),
         num_steps=num_steps,
         exploration_type=DETERMINISTIC,
+        cost_gamma=0.9,
     )
+    described = describe(episodes)
     assert episodes.batch_size == (5,)
     for n in range(5):
         expected = brute_force(script, n, num_steps, 0.25)
         assert set(episodes.keys()) == set(expected)
         for name, value in expected.items():
             assert episodes[name][n].item() == pytest.approx(value, rel=1e-6, abs=1e-6), (name, n)
+        ends = {(True, False): "terminated", (False, True): "truncated", (False, False): "running"}
+        assert described[n]["end"] == ends[expected["terminated"], expected["truncated"]]
+        assert described[n]["return"] == episodes["episode_return"][n].item()
+        for name in ("violations", "entries", "goals", "length"):
+            assert described[n][name] == expected[name]
+            assert isinstance(described[n][name], int)
+        for name in ("score", "cost", "discounted_cost"):
+            assert described[n][name] == pytest.approx(expected[name], rel=1e-6, abs=1e-6)
 
 
 def test_a_step_can_count_for_many_violations():
@@ -257,6 +278,8 @@ def test_evaluate_rejects():
     env = ScriptedEnv(**tables(4))
     with pytest.raises(ValueError, match="num_steps must be at least 1, got 0"):
         evaluate(env, constant_policy(0.0), num_steps=0, exploration_type=RANDOM)
+    with pytest.raises(ValueError, match=r"cost_gamma must be in \[0, 1\], got 1.5"):
+        evaluate(env, constant_policy(0.0), cost_gamma=1.5, exploration_type=RANDOM)
     env = TransformedEnv(ScriptedEnv(**tables(4)), ExcludeTransform("cost"))
     with pytest.raises(KeyError, match=r"cost.* is missing"):
         evaluate(env, constant_policy(0.0), exploration_type=RANDOM)

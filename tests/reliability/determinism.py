@@ -107,7 +107,11 @@ def numbers(folder: Path) -> dict[str, np.ndarray]:
                 found |= {f"{name}, steps": steps, name: values}
     if (folder / "results.json").exists():
         results = json.loads((folder / "results.json").read_text())
+        episodes = results.pop("episodes")
         found |= {name: np.array(value) for name, value in results.items() if name not in TIMES}
+        for kind, played in episodes.items():
+            for name in played[0]:
+                found[f"{kind}episodes, {name}"] = np.array([each[name] for each in played])
     if (folder / "curves.csv").exists():
         table = np.genfromtxt(folder / "curves.csv", delimiter=",", names=True)
         found |= {name: table[name] for name in table.dtype.names if name not in TIMES}

@@ -2,9 +2,9 @@
 
     python tests/reliability/interruption.py --kills 100
 
-Every kill is a SIGINT, SIGTERM or SIGKILL at a random moment between the start of a process and its
-end, half of them while a checkpoint is being written. After each one every checkpoint must be
-whole, no more than one interval may be lost, and a resumed process must go on and finish. In the
+Every kill is a SIGINT, SIGTERM, SIGHUP or SIGKILL at a random moment between the start of a process
+and its end, half of them while a checkpoint is being written. After each one every checkpoint must
+be whole, no more than one interval may be lost, and a resumed process must go on and finish. In the
 end, the log of the run must be that of a run that nobody killed, to the last bit.
 
 Processes are forked from one that has done the imports, which take longer than the run.
@@ -33,7 +33,7 @@ import tiny  # noqa: E402
 from torchrl_safe.record import read_metrics  # noqa: E402
 
 INTERVAL = 2 * tiny.FRAMES
-SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGKILL)
+SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGKILL)
 PATIENCE = 120.0  # seconds until a process counts as hung
 
 
@@ -106,7 +106,7 @@ def attack(kills: int, seed: int, folder: Path) -> dict[str, object]:
     duration, writing = 3.0, 0.1  # seconds, of a process and of a write; measured as we go
     frames = done = 0
     while done < kills:
-        number, aimed = SIGNALS[done % 3], rng.random() < 0.5
+        number, aimed = SIGNALS[done % 4], rng.random() < 0.5
         process = Process(run_dir, frames + 2 * INTERVAL)
         deadline = process.started + rng.uniform(0, duration)
         writes = rng.randint(1, 2)  # which of the process's checkpoints to hit
@@ -139,15 +139,13 @@ def attack(kills: int, seed: int, folder: Path) -> dict[str, object]:
             lost.append(max(0, before - saved))
             assert lost[-1] <= INTERVAL, (before, saved)
         frames = saved_frames(run_dir)
-        # It goes on, to the end.
-        (run_dir / "results.json").unlink(missing_ok=True)
+        # It goes on, to the end, whatever results it had before.
         resumed = Process(run_dir, frames + INTERVAL)
         assert resumed.wait() == 0, resumed.output.read_text()
         assert json.loads((run_dir / "results.json").read_text())["frames"] == frames + INTERVAL
         duration = 0.5 * duration + 0.75 * (time.monotonic() - resumed.started)
         frames = saved_frames(run_dir)
         assert len(list((run_dir / "checkpoints").iterdir())) == 1  # nothing is left behind
-        (run_dir / "results.json").unlink()
     whole = Process(folder / "whole", frames)
     whole.started += 3600  # as long as it takes
     assert whole.wait() == 0, whole.output.read_text()

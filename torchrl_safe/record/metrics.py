@@ -27,6 +27,7 @@ __all__ = [
     "batch_metrics",
     "bootstrap_interval",
     "count_violations",
+    "describe",
     "evaluate",
     "proportion_interval",
     "score",
@@ -140,6 +141,7 @@ def evaluate(
     num_steps: int = 1_000,
     exploration_type: ExplorationType,
     seed: int | None = None,
+    cost_gamma: float = 0.99,
 ) -> TensorDict:
     r"""Plays one episode in every environment of a batch and measures each of them.
 
@@ -166,14 +168,18 @@ def evaluate(
             not. The two differ for a stochastic policy: report both.
         seed (int, optional): seed of the environments and of the sampled actions. Equal seeds
             give equal layouts, which makes policies comparable.
+        cost_gamma (float): discount per step of ``discounted_cost``, in [0, 1]. Defaults to 0.99.
 
     Returns:
-        TensorDict: batch size [\*N], float64, per episode: ``episode_return``, ``violations``
-        (steps), ``cv_rate`` and ``cost_rate`` (per step), ``score``, ``goals`` (steps that met
-        one), ``length`` (steps taken).
+        TensorDict: batch size [\*N], per episode. In float64: ``episode_return``, ``violations``
+        (steps), ``entries`` (violating steps after one that was none, or at the start), ``cv_rate``
+        and ``cost_rate`` (per step), ``cost`` and ``discounted_cost`` (sums), ``score``, ``goals``
+        (steps that met one), ``length`` (steps taken). In bool, how it ended: ``terminated``,
+        ``truncated``, or neither if ``num_steps`` were over first.
 
     Raises:
-        ValueError: if ``num_steps`` is not positive, or a leaf has another shape.
+        ValueError: if ``num_steps`` is not positive, ``cost_gamma`` is not in [0, 1], or a leaf has
+            another shape.
         KeyError: if the environment does not write one of the leaves.
 
     Examples:
@@ -190,24 +196,37 @@ def evaluate(
     """
     if num_steps < 1:
         raise ValueError(f"num_steps must be at least 1, got {num_steps}.")
-    names = ("reward", "cost", "violations", "goal_met", "length", "duration")
+    if not 0.0 <= cost_gamma <= 1.0:
+        raise ValueError(f"cost_gamma must be in [0, 1], got {cost_gamma}.")
+    names = (
+        *("reward", "cost", "discounted_cost", "violations", "entries", "goal_met"),
+        *("length", "duration"),
+    )
     zero = torch.zeros(env.batch_size, dtype=torch.float64, device=env.device)
     total = {name: zero.clone() for name in names}
     running = torch.ones(env.batch_size, dtype=torch.bool, device=env.device)
+    violated = torch.zeros_like(running)
+    ends = {name: torch.zeros_like(running) for name in ("terminated", "truncated")}
     with acting(exploration_type):
         if seed is not None:
             env.set_seed(seed)
             # An environment may seed more than itself, or less: the policy's noise starts here.
             torch.manual_seed(seed)
         td = env.reset()
-        for _ in range(num_steps):
+        for step in range(num_steps):
             stepped, td = env.step_and_maybe_reset(policy(td))
             violations = _violations(stepped)
             for name in ("reward", "cost", "goal_met"):
                 total[name] += _signal(stepped, ("next", name)).double().where(running, 0.0)
+            cost = _signal(stepped, ("next", "cost")).double()
+            total["discounted_cost"] += (cost_gamma**step * cost).where(running, 0.0)
             total["violations"] += violations.where(running, 0.0)
+            total["entries"] += running & (violations > 0) & ~violated
+            violated = violations > 0
             total["length"] += running
             total["duration"] += violations.clamp(min=1.0).where(running, 0.0)
+            for name, ended in ends.items():
+                ended |= running & _signal(stepped, ("next", name))
             running = running & ~_signal(stepped, ("next", "done"))
             if not running.any():
                 break
@@ -215,11 +234,15 @@ def evaluate(
         {
             "episode_return": total["reward"],
             "violations": total["violations"],
+            "entries": total["entries"],
             "cv_rate": total["violations"] / total["duration"],
             "score": score(total["reward"], total["violations"]),
+            "cost": total["cost"],
+            "discounted_cost": total["discounted_cost"],
             "cost_rate": total["cost"] / total["duration"],
             "goals": total["goal_met"],
             "length": total["length"],
+            **ends,
         },
         batch_size=env.batch_size,
     )
@@ -233,8 +256,9 @@ def summarize(episodes: TensorDictBase, prefix: str = "eval/") -> dict[str, floa
         prefix (str): put before every name. Defaults to ``"eval/"``.
 
     Returns:
-        dict of float: ``return``, ``violations``, ``cv_rate``, ``score``, ``cost_rate``,
-        ``goals``, ``length`` and the 95 % interval ``score_low``, ``score_high`` of the score.
+        dict of float: ``return``, ``violations``, ``entries``, ``cv_rate``, ``score``, ``cost``,
+        ``discounted_cost``, ``cost_rate``, ``goals``, ``length``, the shares ``terminated`` and
+        ``truncated``, and the 95 % interval ``score_low``, ``score_high`` of the score.
 
     Raises:
         ValueError: if there is no episode.
@@ -254,6 +278,45 @@ def summarize(episodes: TensorDictBase, prefix: str = "eval/") -> dict[str, floa
     }
     low, high = bootstrap_interval(episodes["score"].flatten())
     return {**metrics, f"{prefix}score_low": low, f"{prefix}score_high": high}
+
+
+def describe(episodes: TensorDictBase) -> list[dict[str, float | int | str]]:
+    """Episodes one by one, as plain values that JSON takes.
+
+    Args:
+        episodes (TensorDictBase): what :func:`evaluate` returned, any batch size.
+
+    Returns:
+        list of dict, one per episode: ``return``, ``score``, ``cost``, ``discounted_cost``; the
+        counts ``violations``, ``entries``, ``goals`` and ``length``; and ``end``, which is
+        ``"terminated"``, ``"truncated"`` or, where steps were over first, ``"running"``.
+
+    Examples:
+        >>> from torchrl.envs.utils import ExplorationType
+        >>> from torchrl_safe.envs import SafeGoalEnv
+        >>> env = SafeGoalEnv("point", num_envs=2, num_threads=1)
+        >>> episodes = evaluate(
+        ...     env, env.rand_action, num_steps=5, exploration_type=ExplorationType.RANDOM, seed=0
+        ... )
+        >>> [(episode["length"], episode["end"]) for episode in describe(episodes)]
+        [(5, 'running'), (5, 'running')]
+    """
+    episodes = episodes.flatten()
+    columns = {
+        "return": episodes["episode_return"].tolist(),
+        **{name: episodes[name].tolist() for name in ("score", "cost", "discounted_cost")},
+        **{
+            name: episodes[name].long().tolist()
+            for name in ("violations", "entries", "goals", "length")
+        },
+        "end": [
+            "terminated" if terminated else "truncated" if truncated else "running"
+            for terminated, truncated in zip(
+                episodes["terminated"].tolist(), episodes["truncated"].tolist(), strict=True
+            )
+        ],
+    }
+    return [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
 
 
 def count_violations(td: TensorDictBase) -> int:

@@ -187,10 +187,11 @@ class GymGoalEnv(gymnasium.Env[NDArray[Any], NDArray[Any]]):
         self._core.restore(snapshot)
 
     def close(self) -> None:
-        """Closes the window or the GL context."""
+        """Closes the window or the GL context, and ends the simulator."""
         if self._renderer is not None:
             self._renderer.close()
             self._renderer = None
+        self._core.close()
 
 
 class GymGoalVectorEnv(gymnasium.vector.VectorEnv[NDArray[Any], NDArray[Any], NDArray[Any]]):
@@ -370,10 +371,11 @@ class GymGoalVectorEnv(gymnasium.vector.VectorEnv[NDArray[Any], NDArray[Any], ND
         return tuple(self._renderer.draw(index) for index in range(self.num_envs))
 
     def close_extras(self, **kwargs: Any) -> None:
-        """Frees the GL context."""
+        """Frees the GL context and ends the simulator's threads."""
         if self._renderer is not None:
             self._renderer.close()
             self._renderer = None
+        self._core.close()
 
 
 def register_envs() -> None:

@@ -2,28 +2,49 @@
 
 from __future__ import annotations
 
+import copy
+import dataclasses
+import gc
 import os
+import pickle
 import shutil
 import subprocess
 import sys
 import textwrap
 import time
+import weakref
 
 import gymnasium
+import mujoco
 import numpy as np
 import pytest
 import torch
 from gymnasium.utils.passive_env_checker import env_render_passive_checker
 
-from torchrl_safe.envs import ROBOTS, GymGoalEnv, SafeGoalEnv, suite
+from torchrl_safe.envs import ROBOTS, GymGoalEnv, SafeGoalEnv, get_robot, suite
 from torchrl_safe.envs._core import make_core
-from torchrl_safe.envs._render import Scene
+from torchrl_safe.envs._render import Scene, SceneRenderer
 
 
-def seeded_core(robot: str):
+def seeded_core(robot):
     core = make_core(robot, num_envs=2, num_threads=1, seed=1, episode_length=1000)
     core.reset()
     return core
+
+
+def pickled(thing):
+    return pickle.loads(pickle.dumps(thing))
+
+
+def run(code: str, **environ: str) -> subprocess.CompletedProcess:
+    """In a process of its own, which is killed after two minutes."""
+    return subprocess.run(
+        [sys.executable, "-c", code],
+        env=os.environ | environ,
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
 
 
 @pytest.fixture(scope="module")
@@ -95,6 +116,86 @@ class TestScene:
         env.close()
 
 
+def dressed_point(tmp_path, *changes: tuple[str, str]):
+    """Point with more in its file."""
+    text = get_robot("point").asset_path.read_text()
+    for old, new in changes:
+        assert old in text
+        text = text.replace(old, new)
+    file = tmp_path / "point.xml"
+    file.write_text(text)
+    return dataclasses.replace(get_robot("point"), asset=str(file))
+
+
+OUTSIDE = 'contype="0" conaffinity="0"'
+FILES = {
+    "assets": (
+        "<worldbody>",
+        '<asset><texture name="floor" type="2d" builtin="flat" width="9" height="9"/>'
+        '<material name="floor" texture="floor"/></asset><worldbody>',
+    ),
+    "cameras and lights": (
+        "<worldbody>",
+        '<worldbody><camera name="overview" pos="0 0 3"/><camera name="follow" pos="0 0 3"/>'
+        '<light name="sun"/>',
+    ),
+    "geoms": (
+        "<worldbody>",
+        f'<worldbody><geom name="floor" size=".01" {OUTSIDE}/>'
+        f'<geom name="hazard1:0" size=".01" {OUTSIDE}/>',
+    ),
+    "mocap bodies": (
+        "<worldbody>",
+        f'<worldbody><body name="prop0:0" mocap="true"><geom size=".01" {OUTSIDE}/></body>',
+    ),
+    "keyframes": ("</mujoco>", '<keyframe><key name="rest" qpos="1 1 1"/></keyframe></mujoco>'),
+    "what is not seen": ("<option>", '<compiler discardvisual="true"/><option>'),
+    "defaults": (
+        '<geom density="1"',
+        '<material rgba="1 0 0 1"/><geom group="4" density="1"',
+    ),
+}
+
+
+class TestRobotsOfOnesOwn:
+    """Any name in a file; what is drawn around the robot is the same."""
+
+    @pytest.mark.parametrize("what", FILES)
+    def test_scene(self, what, tmp_path):
+        robot = dressed_point(tmp_path, FILES[what])
+        core, plain = seeded_core(robot), seeded_core("point")
+        scene, expected = Scene(core), Scene(plain)
+        for each in (scene, expected):
+            each.show(1)
+
+        def objects(scene):
+            model, data = scene.model, scene.data
+            seen = model.geom_group < 3
+            seen &= np.isin(model.geom_type, [mujoco.mjtGeom.mjGEOM_CYLINDER])
+            return np.concatenate((data.geom_xpos[seen], model.geom_rgba[seen]), 1)
+
+        assert len(objects(scene)) == 9
+        np.testing.assert_allclose(objects(scene), objects(expected))
+
+    @pytest.mark.parametrize("what", FILES)
+    def test_dm_control(self, what, tmp_path):
+        env = suite.load(dressed_point(tmp_path, FILES[what]), random=0)
+        env.reset()
+        env.step(np.ones(2))
+        assert env.physics.model.camera("overview").id >= 0
+
+    def test_picture(self, tmp_path, opengl):
+        pictures = []
+        robots = ("point", dressed_point(tmp_path, *FILES.values()))
+        for robot in robots:
+            env = SafeGoalEnv(robot, num_envs=1, num_threads=1, seed=1)
+            env.reset()
+            pictures.append(env.render().astype(int))
+            env.close()
+        # But for two specks, and a light.
+        assert np.abs(pictures[0] - pictures[1]).mean() < 20
+
+
 class TestTogether:
     def test_the_cost_is_shown(self, opengl):
         """The corner changes with the cost and nothing else does."""
@@ -138,25 +239,108 @@ class TestTogether:
         two.close()
         assert (draw_other() == third).all()
         assert (one.render() == first).all()
+        two = SafeGoalEnv(num_envs=1, num_threads=1, seed=1)
+        two.reset()
         assert (two.render() == second).all()
         one.close()
         two.close()
         assert (draw_other() == third).all()
         other.physics.free()
 
-    def test_left_open(self, opengl):
-        """Whoever forgets to close gets no traceback at the end of the program."""
-        code = """
-            from torchrl_safe.envs import SafeGoalEnv
+    @pytest.mark.parametrize("order", ["alone", "before dm_control", "after dm_control"])
+    def test_left_open(self, order, opengl):
+        """Whoever forgets to close gets no traceback at the end of the program.
+
+        dm_control ends EGL at exit, for everybody, sooner or later than we do.
+        """
+        picture = """
             env = SafeGoalEnv(num_envs=1, num_threads=1)
             env.reset()
             env.render()
         """
-        done = subprocess.run(
-            [sys.executable, "-c", textwrap.dedent(code)], capture_output=True, text=True
-        )
+        other = """
+            from torchrl_safe.envs import suite
+            other = suite.load()
+            other.reset()
+            other.physics.render(48, 64)
+        """
+        parts = {
+            "alone": picture,
+            "before dm_control": picture + other,
+            "after dm_control": other + picture,
+        }
+        done = run("from torchrl_safe.envs import SafeGoalEnv\n" + textwrap.dedent(parts[order]))
         assert done.returncode == 0
+        assert "Exception ignored" not in done.stderr
         assert "Traceback" not in done.stderr
+
+    def test_left_to_the_garbage_collector(self, opengl):
+        env = SafeGoalEnv(num_envs=1, num_threads=1)
+        env.reset()
+        env.render(0, 16, 16)
+        canvas = weakref.ref(env._renderer._canvas)
+        finalizer = canvas().free
+        del env
+        gc.collect()
+        assert canvas() is None
+        assert not finalizer.alive
+
+    @pytest.mark.parametrize("robot", ROBOTS)
+    @pytest.mark.parametrize("duplicate", [copy.copy, copy.deepcopy, pickled])
+    def test_copies_draw_for_themselves(self, robot, duplicate, opengl):
+        core = seeded_core(robot)
+        renderer = SceneRenderer(core, 64, 48)
+        for _ in range(2):  # before it has drawn, and after
+            twin = duplicate(renderer)
+            assert (twin.draw(1) == renderer.draw(1)).all()
+            twin.close()
+        renderer.close()
+        assert renderer.draw(1).std() > 5  # closed is not broken
+        renderer.close()
+
+    @pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
+    def test_a_forked_process_does_not_draw(self, opengl):
+        """Nor does it free, at exit, what belongs to its parent."""
+        code = """
+            import os
+            from torchrl_safe.envs import SafeGoalEnv
+            env = SafeGoalEnv(num_envs=1, num_threads=1)
+            env.reset()
+            before = env.render()
+            if not os.fork():
+                try:
+                    env.render()
+                except RuntimeError as error:
+                    assert "forked" in str(error)
+                    raise SystemExit(0)
+                raise SystemExit(1)
+            _, status = os.wait()
+            assert status == 0
+            assert (env.render() == before).all()
+        """
+        done = run(textwrap.dedent(code))
+        assert done.returncode == 0, done.stderr
+        assert "Exception ignored" not in done.stderr
+
+    @pytest.mark.skipif(sys.platform != "linux", reason="elsewhere there always is a display")
+    @pytest.mark.parametrize("face", ["SafeGoalEnv", "dm_control"])
+    def test_a_display_that_leads_nowhere(self, face, opengl):
+        code = {
+            "SafeGoalEnv": """
+                from torchrl_safe.envs import SafeGoalEnv
+                env = SafeGoalEnv(num_envs=1, num_threads=1)
+                env.reset()
+                assert env.render().std() > 5
+            """,
+            "dm_control": """
+                from torchrl_safe.envs import suite
+                env = suite.load()
+                env.reset()
+                assert env.physics.render(48, 64, camera_id="overview").std() > 5
+            """,
+        }[face]
+        done = run(textwrap.dedent(code), DISPLAY=":7891", MUJOCO_GL="")
+        assert done.returncode == 0, done.stderr
 
 
 class TestHuman:

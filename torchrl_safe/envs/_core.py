@@ -6,6 +6,8 @@ is around the robots belongs to the task, as arrays and not as bodies in the phy
 
 from __future__ import annotations
 
+import os
+import weakref
 from collections.abc import Iterable
 from typing import Any, NamedTuple
 
@@ -14,6 +16,7 @@ import numpy as np
 from mujoco.batch import Batch, SimulationError
 from numpy.typing import NDArray
 
+from torchrl_safe.envs._process import keep_forever
 from torchrl_safe.envs._random import RandomStreams
 from torchrl_safe.envs.randomization import (
     Randomization,
@@ -39,8 +42,8 @@ _ACCELERATION = mujoco.mjtStage.mjSTAGE_ACC.value
 class RobotBatch:
     """N copies of a robot on a thread pool.
 
-    The pool is built at first use and left behind by pickling, which keeps the simulations' state;
-    rollouts do not depend on the number of threads.
+    The pool is built at first use. Copies, pickles and forked processes leave it behind, keep the
+    simulations' state and build their own; rollouts do not depend on the number of threads.
 
     Args:
         robot (Robot): the robot.
@@ -74,12 +77,20 @@ class RobotBatch:
             self.commands = np.zeros((num_envs, max_delay + 1, self._model.nu))
         self._batch: Batch | None = None
         self._saved: Array | None = None
+        self._closed = False
 
     @property
     def batch(self) -> Batch:
-        """The thread pool."""
+        """The thread pool.
+
+        Raises:
+            RuntimeError: if the robots are closed.
+        """
+        if self._closed:
+            raise RuntimeError("the environment is closed: make another one.")
         if self._batch is None:
             self._batch = batch = Batch(self._model, self.num_envs, self.num_threads)
+            _POOLS.add(self)
             self._initial = batch.state[0].copy()
             self._qpos, self._qvel = batch.bind("qpos"), batch.bind("qvel")
             self._time = batch.bind("time")
@@ -98,6 +109,15 @@ class RobotBatch:
         kept = {name: value for name, value in self.__dict__.items() if name not in bound}
         saved = self._saved if self._batch is None else self._batch.state.copy()
         return kept | {"_batch": None, "_saved": saved}
+
+    def close(self) -> None:
+        """Ends the threads and frees the simulations."""
+        self.__dict__ = self.__getstate__() | {"_saved": None, "_closed": True}
+
+    def leave_pool(self) -> None:
+        """Goes on with a pool of its own: that of the process this one was forked from is dead."""
+        keep_forever(self._batch)
+        self.__dict__ = self.__getstate__()
 
     @property
     def state(self) -> Array:
@@ -126,8 +146,7 @@ class RobotBatch:
         batch.forward(rows)
         if self.commands is not None:
             self.commands = _with_rows(self.commands, rows, np.zeros(1))
-        sensed = self.robot.sense(self._qpos[rows], self._qvel[rows], self._qacc[rows])
-        pairs = zip(self.motion, sensed, strict=True)
+        pairs = zip(self.motion, self._sense(rows), strict=True)
         self.motion = Motion(*(_with_rows(old, rows, new) for old, new in pairs))
 
     def step(self, action: Array) -> Mask:
@@ -150,7 +169,7 @@ class RobotBatch:
         for value in (self._qpos, self._qvel, self._qacc):
             # MuJoCo looks at the states that physics steps start from only. NaN compares false.
             failed |= ~(np.abs(value).max(-1) < mujoco.mjMAXVAL)
-        sensed = self.robot.sense(self._qpos, self._qvel, self._qacc)
+        sensed = self._sense(slice(None))
         if failed.any():
             batch.state[failed] = self._before[failed]
             self._warning[failed] = 0
@@ -159,6 +178,11 @@ class RobotBatch:
         self.motion = sensed
         return failed
 
+    def _sense(self, rows: Rows | slice) -> Motion:
+        # Copies: what a robot returns may be part of the live state.
+        sensed = self.robot.sense(self._qpos[rows], self._qvel[rows], self._qacc[rows])
+        return Motion(*map(np.array, sensed))
+
     def _late(self, command: Array) -> Array:
         """The command [N, nu] that arrives when this one is sent."""
         if self.variation is None or self.commands is None:
@@ -166,6 +190,19 @@ class RobotBatch:
         self.commands = np.concatenate((command[:, None], self.commands[:, :-1]), 1)
         delay = self.variation.actuator_delay.astype(np.intp)
         return self.commands[np.arange(self.num_envs), delay]
+
+
+_POOLS: weakref.WeakSet[RobotBatch] = weakref.WeakSet()
+
+
+def _leave_pools() -> None:
+    for robots in list(_POOLS):
+        robots.leave_pool()
+    _POOLS.clear()
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_leave_pools)
 
 
 class Frame(NamedTuple):
@@ -347,6 +384,10 @@ class Core:
         scan = drop_readings(scan, variation.lidar_dropout[rows], self._streams, rows)
         observation = self.task.observe(self.robot, motion, objects, scan)
         return add_noise(observation, variation.sensor_noise[rows], self._streams, rows)
+
+    def close(self) -> None:
+        """Ends the simulator's threads; steps, resets and snapshots raise from then on."""
+        self._robots.close()
 
     def layout(self, index: int) -> dict[str, Array]:
         """Copies of robot [2], heading [2] and the task's objects of one environment, metres."""

@@ -270,14 +270,12 @@ class SafeGoalEnv(EnvBase):
             self._core.restore({name: value.cpu().numpy() for name, value in state_dict.items()})
 
     def close(self, *, raise_if_closed: bool = True) -> None:
-        """Frees the renderer."""
+        """Frees the renderer and ends the simulator's threads; a closed environment says so."""
         if self._renderer is not None:
             self._renderer.close()
             self._renderer = None
+        self._core.close()
         super().close(raise_if_closed=raise_if_closed)
-
-    def __getstate__(self) -> dict[str, Any]:
-        return {**self.__dict__, "_renderer": None}
 
 
 def _column(value: NDArray[Any], dtype: DTypeLike | None = None) -> torch.Tensor:

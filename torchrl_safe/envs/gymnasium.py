@@ -97,7 +97,6 @@ class GymGoalEnv(gymnasium.Env[NDArray[Any], NDArray[Any]]):
         self._size = (width, height)
         self._renderer: Any = None
         self._drawn_at = 0.0
-        self._closed = False
 
     @property
     def spec(self) -> EnvSpec | None:
@@ -121,7 +120,6 @@ class GymGoalEnv(gymnasium.Env[NDArray[Any], NDArray[Any]]):
             ValueError: if the seed is negative or there are options.
             RuntimeError: if the environment is closed.
         """
-        _require(not self._closed)
         _no_options(options)
         check_seed("seed", seed)
         super().reset(seed=seed)
@@ -147,7 +145,6 @@ class GymGoalEnv(gymnasium.Env[NDArray[Any], NDArray[Any]]):
             ValueError: if the action has another shape or is not finite; nothing has moved then.
             RuntimeError: before the first reset, or if the environment is closed.
         """
-        _require(not self._closed)
         action = _checked_action(action, self.action_space.shape)
         frame = self._core.step(action[None])
         if self.render_mode == "human":
@@ -166,7 +163,6 @@ class GymGoalEnv(gymnasium.Env[NDArray[Any], NDArray[Any]]):
         Raises:
             RuntimeError: if there is no display to open a window on, or the environment is closed.
         """
-        _require(not self._closed)
         if self.render_mode is None:
             gymnasium.logger.warn(_NO_RENDER_MODE)
             return None
@@ -200,11 +196,11 @@ class GymGoalEnv(gymnasium.Env[NDArray[Any], NDArray[Any]]):
         self._core.restore(snapshot)
 
     def close(self) -> None:
-        """Closes the window or the GL context; the environment does not step or draw any more."""
-        self._closed = True
+        """Closes the window or the GL context, and ends the simulator."""
         if self._renderer is not None:
             self._renderer.close()
             self._renderer = None
+        self._core.close()
 
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "_renderer": None}
@@ -343,7 +339,6 @@ class GymGoalVectorEnv(gymnasium.vector.VectorEnv[NDArray[Any], NDArray[Any], ND
                 mask is not a bool array [N], or there are other options.
             RuntimeError: if the environment is closed.
         """
-        _require(not self.closed)
         options = dict(options or {})
         mask = np.ones(self.num_envs, bool)
         partial = "reset_mask" in options
@@ -394,7 +389,6 @@ class GymGoalVectorEnv(gymnasium.vector.VectorEnv[NDArray[Any], NDArray[Any], ND
             RuntimeError: before the first reset, if an episode is over and autoreset is off, or if
                 the environment is closed.
         """
-        _require(not self.closed)
         actions = _checked_action(actions, self.action_space.shape)
         over = self._over
         if over.any() and self.autoreset_mode is AutoresetMode.DISABLED:
@@ -430,7 +424,6 @@ class GymGoalVectorEnv(gymnasium.vector.VectorEnv[NDArray[Any], NDArray[Any], ND
         Raises:
             RuntimeError: if the environment is closed.
         """
-        _require(not self.closed)
         if self.render_mode is None:
             gymnasium.logger.warn(_NO_RENDER_MODE)
             return None
@@ -441,10 +434,11 @@ class GymGoalVectorEnv(gymnasium.vector.VectorEnv[NDArray[Any], NDArray[Any], ND
         return tuple(self._renderer.draw(index) for index in range(self.num_envs))
 
     def close_extras(self, **kwargs: Any) -> None:
-        """Frees the GL context; the environment does not step or draw any more."""
+        """Frees the GL context and ends the simulator's threads."""
         if self._renderer is not None:
             self._renderer.close()
             self._renderer = None
+        self._core.close()
 
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "_renderer": None}
@@ -453,11 +447,6 @@ class GymGoalVectorEnv(gymnasium.vector.VectorEnv[NDArray[Any], NDArray[Any], ND
 def _with_length(spec: EnvSpec | None, core: Core) -> EnvSpec | None:
     """Gymnasium leaves the length out, as it knows only of limits that it sets itself."""
     return None if spec is None else replace(spec, max_episode_steps=core.episode_length)
-
-
-def _require(is_open: bool) -> None:
-    if not is_open:
-        raise RuntimeError("the environment is closed: make another one.")
 
 
 def _spaces(core: Core) -> tuple[gymnasium.spaces.Box, gymnasium.spaces.Box]:

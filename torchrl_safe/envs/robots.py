@@ -155,7 +155,7 @@ def _sense_planar(qpos: Array, qvel: Array, qacc: Array) -> Motion:
     to_robot_frame(qacc[:, :2], heading, out=proprioception[:, :2])
     to_robot_frame(qvel[:, :2], heading, out=proprioception[:, 2:4])
     proprioception[:, 4] = qvel[:, 2]
-    return Motion(qpos[:, :2].copy(), heading, proprioception)
+    return Motion(qpos[:, :2], heading, proprioception)
 
 
 def _sense_wheels(qpos: Array, qvel: Array, qacc: Array) -> Motion:
@@ -163,7 +163,7 @@ def _sense_wheels(qpos: Array, qvel: Array, qacc: Array) -> Motion:
     w, x, y, z = qpos[:, 3:7].T
     heading = _unit(np.stack((1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y + w * z)), 1))
     forward = (heading * qvel[:, :2]).sum(1)
-    return Motion(qpos[:, :2].copy(), heading, np.stack((forward, qvel[:, 5]), 1))
+    return Motion(qpos[:, :2], heading, np.stack((forward, qvel[:, 5]), 1))
 
 
 def _rotation(quaternion: Array) -> Array:
@@ -197,7 +197,7 @@ def _sense_free(qpos: Array, qvel: Array, qacc: Array) -> Motion:
     proprioception[:, :2] = np.einsum("nji,nj->ni", rotation[:, :, :2], felt)
     proprioception[:, 2:4] = np.einsum("nji,nj->ni", rotation[:, :, :2], qvel[:, :3])
     proprioception[:, 4] = qvel[:, 5]
-    return Motion(qpos[:, :2].copy(), _heading(rotation), proprioception)
+    return Motion(qpos[:, :2], _heading(rotation), proprioception)
 
 
 def _sense_joints(qpos: Array, qvel: Array, qacc: Array) -> Motion:
@@ -216,7 +216,7 @@ def _sense_joints(qpos: Array, qvel: Array, qacc: Array) -> Motion:
         np.sin(angle),
         np.cos(angle),
     )
-    return Motion(qpos[:, :2].copy(), _heading(rotation), np.concatenate(parts, 1))
+    return Motion(qpos[:, :2], _heading(rotation), np.concatenate(parts, 1))
 
 
 def _control_legs(action: Array, qpos: Array, qvel: Array, time: Array, weights: Path) -> Array:

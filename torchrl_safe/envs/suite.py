@@ -13,13 +13,13 @@ from numpy.typing import NDArray
 
 from torchrl_safe.envs._core import Core, make_core
 from torchrl_safe.envs._random import check_seed
-from torchrl_safe.envs._render import Scene
+from torchrl_safe.envs._render import Scene, has_display
 from torchrl_safe.envs.randomization import Randomization
 from torchrl_safe.envs.robots import Array, Robot
 from torchrl_safe.envs.tasks import Task
 
 # dm_control chooses how to draw when it is imported, and without a display would choose a window.
-if sys.platform == "linux" and not os.environ.get("DISPLAY"):
+if sys.platform == "linux" and not has_display():
     os.environ.setdefault("MUJOCO_GL", "egl")
 
 from dm_control import mujoco

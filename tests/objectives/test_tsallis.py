@@ -41,6 +41,32 @@ def make_qvalue(out_key="state_action_value"):
     return ValueOperator(net, in_keys=["observation", "action"], out_keys=[out_key])
 
 
+def make_on_one_trunk():
+    """An actor and a critic that read the observation through one layer."""
+    trunk = nn.Linear(OBS, OBS, dtype=torch.float64)
+    heads = (MLP(OBS, 2 * ACT, num_cells=[]).double(), MLP(OBS + ACT, 1, num_cells=[]).double())
+    actor = ProbabilisticActor(
+        TensorDictModule(
+            nn.Sequential(trunk, heads[0], NormalParamExtractor()),
+            in_keys=["observation"],
+            out_keys=["loc", "scale"],
+        ),
+        in_keys=["loc", "scale"],
+        spec=Bounded(-1, 1, (ACT,), dtype=torch.float64),
+        distribution_class=TanhNormal,
+    )
+
+    class Critic(nn.Module):
+        def __init__(self):
+            super().__init__()
+            self.trunk, self.head = trunk, heads[1]
+
+        def forward(self, observation, action):
+            return self.head(torch.cat([self.trunk(observation), action], -1))
+
+    return actor, ValueOperator(Critic(), in_keys=["observation", "action"]), trunk
+
+
 def make_data(batch=(8,), dtype=torch.float64):
     generator = torch.Generator().manual_seed(3)
 
@@ -331,46 +357,79 @@ class TestLossModule:
             torch.testing.assert_close(value, expected[key])
 
     @pytest.mark.parametrize("separate_losses", [False, True])
-    def test_separate_losses(self, blocks, separate_losses):
-        """With separate losses the Q-value loss does not move what the critic shares."""
-        trunk = nn.Linear(OBS, OBS, dtype=torch.float64)
-        heads = (MLP(OBS, 2 * ACT, num_cells=[]).double(), MLP(OBS + ACT, 1, num_cells=[]).double())
-        actor = ProbabilisticActor(
-            TensorDictModule(
-                nn.Sequential(trunk, heads[0], NormalParamExtractor()),
-                in_keys=["observation"],
-                out_keys=["loc", "scale"],
-            ),
-            in_keys=["loc", "scale"],
-            spec=Bounded(-1, 1, (ACT,), dtype=torch.float64),
-            distribution_class=TanhNormal,
-        )
-
-        class Critic(nn.Module):
-            def __init__(self):
-                super().__init__()
-                self.trunk, self.head = trunk, heads[1]
-
-            def forward(self, observation, action):
-                return self.head(torch.cat([self.trunk(observation), action], -1))
-
-        qvalue = ValueOperator(Critic(), in_keys=["observation", "action"])
+    def test_one_critic_is_the_network_itself(self, separate_losses):
+        """Its weights and the trunk it shares with the actor; separate losses do not move that."""
+        actor, qvalue, trunk = make_on_one_trunk()
+        weights = {name: p.clone() for name, p in qvalue.named_parameters()}
+        data = make_data()
+        expected = qvalue(data.clone())["state_action_value"].squeeze(-1)
         loss = TsallisLoss(
             actor,
             qvalue,
             num_qvalue_nets=1,
             delay_qvalue=False,
             separate_losses=separate_losses,
+            alpha_init=1e-12,
         )
-        loss(make_data())["loss_qvalue"].backward()
-        params = loss.qvalue_network_params["module"]
-        assert params["head", "0", "weight"].grad.any()
-        # An ensemble has a copy of the trunk of its own; with separate losses it borrows the
-        # actor's, which its loss does not move.
-        shared = params["trunk", "weight"]
-        assert (shared.grad is None) is separate_losses
-        assert torch.equal(shared[0], trunk.weight) is separate_losses
-        assert trunk.weight.grad is None
+        for name, p in qvalue.named_parameters():
+            assert torch.equal(p, weights[name])
+        value = loss.objective(data, data["action"], data["action_log_prob"])
+        torch.testing.assert_close(value, expected)
+        # Every parameter once: 12 of the trunk, 16 of the actor's head, 6 of the critic's, alpha.
+        assert sum(p.numel() for p in loss.parameters()) == 12 + 16 + 6 + 1
+        loss(data)["loss_qvalue"].backward()
+        assert qvalue.module.head[0].weight.grad.any()
+        assert (trunk.weight.grad is None) is separate_losses
+
+    def test_copies_do_not_lose_in_silence_what_is_shared(self):
+        actor, qvalue, trunk = make_on_one_trunk()
+        with pytest.raises(ValueError, match=r"num_qvalue_nets=2 makes copies, and qvalue_network"):
+            TsallisLoss(actor, qvalue)
+        loss = TsallisLoss(actor, qvalue, separate_losses=True, delay_qvalue=False)
+        borrowed = loss.qvalue_network_params["module", "trunk", "weight"]
+        assert borrowed.data_ptr() == trunk.weight.data_ptr()
+
+    @pytest.mark.parametrize("deactivate_vmap", [False, True])
+    def test_a_list_of_critics_keeps_their_weights(self, blocks, deactivate_vmap):
+        actor, _ = blocks
+        critics = [make_qvalue().double() for _ in range(3)]
+        data = make_data()
+        expected = torch.stack([each(data.clone())["state_action_value"] for each in critics])
+        loss = TsallisLoss(
+            actor,
+            critics,
+            num_qvalue_nets=3,
+            delay_qvalue=False,
+            deactivate_vmap=deactivate_vmap,
+            alpha_init=1e-12,
+        )
+        value = loss.objective(data, data["action"], data["action_log_prob"])
+        torch.testing.assert_close(value, expected.squeeze(-1).min(0)[0])
+
+    @pytest.mark.parametrize("deactivate_vmap", [False, True])
+    @pytest.mark.parametrize("count", [1, 2])
+    def test_hooks_of_critics_are_called(self, blocks, count, deactivate_vmap):
+        """A hook that doubles what the critic writes doubles its prediction."""
+        loss = TsallisLoss(
+            *blocks,
+            num_qvalue_nets=count,
+            deactivate_vmap=deactivate_vmap,
+            delay_qvalue=False,
+            alpha_init=1e-12,
+        )
+        data = make_data()
+
+        def value():
+            return loss.objective(data, data["action"], data["action_log_prob"])
+
+        def double(module, args, output):
+            output["state_action_value"] = 2 * output["state_action_value"]
+
+        before = value()
+        handle = loss.qvalue_network.register_forward_hook(double)
+        torch.testing.assert_close(value(), 2 * before)
+        handle.remove()
+        torch.testing.assert_close(value(), before)
 
     def test_multi_step_batch(self, blocks):
         """The target of 3-step transitions: three rewards, then the value of the third state."""
@@ -565,9 +624,28 @@ class TestMisuse:
         with pytest.raises(ValueError, match="entropic_index must be"):
             TsallisLoss(*blocks, entropic_index=q)
 
-    def test_num_qvalue_nets(self, blocks):
-        with pytest.raises(ValueError, match="num_qvalue_nets must be at least 1, got 0"):
-            TsallisLoss(*blocks, num_qvalue_nets=0)
+    @pytest.mark.parametrize("count", [0, -2, 1.0, True])
+    def test_num_qvalue_nets(self, blocks, count):
+        with pytest.raises(
+            ValueError, match=f"num_qvalue_nets must be an integer, at least 1, got {count}"
+        ):
+            TsallisLoss(*blocks, num_qvalue_nets=count)
+
+    def test_a_list_of_another_length(self, blocks):
+        actor, qvalue = blocks
+        with pytest.raises(ValueError, match="as many networks as num_qvalue_nets says, got .*=2"):
+            TsallisLoss(actor, [qvalue, make_qvalue(), make_qvalue()], num_qvalue_nets=2)
+
+    def test_a_list_of_one_network_twice(self, blocks):
+        actor, qvalue = blocks
+        with pytest.raises(ValueError, match="qvalue_network shares parameters"):
+            TsallisLoss(actor, [qvalue, qvalue])
+
+    def test_a_list_of_unlike_networks(self, blocks):
+        actor, qvalue = blocks
+        other = ValueOperator(MLP(OBS + ACT, 1, num_cells=[5]), in_keys=qvalue.in_keys)
+        with pytest.raises(ValueError, match="qvalue_network: networks of a list must have"):
+            TsallisLoss(actor, [qvalue, other])
 
     def test_alpha(self, blocks):
         with pytest.raises(ValueError, match=r"alpha_init must be positive, got -1"):

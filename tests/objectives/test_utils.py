@@ -148,3 +148,12 @@ def test_random_layers_draw_for_each_member():
     call = ensemble(linear, randomness="different", deactivate_vmap=True)
     first, second = call(TensorDict({"x": torch.ones(1, 1)}, [1]), params, "y")
     assert not torch.equal(first == 0, second == 0)
+
+
+@pytest.mark.parametrize("deactivate_vmap", [False, True])
+def test_one_network_without_a_dimension_of_members(deactivate_vmap):
+    (member,), data = make_members(1), make_data()
+    params = from_modules(member, as_module=True)
+    call = ensemble(make_module().eval(), randomness="error", deactivate_vmap=deactivate_vmap)
+    assert not params[0].batch_dims
+    torch.testing.assert_close(call(data, params[0], "first"), call(data, params, "first"))

@@ -7,7 +7,7 @@ functions and add nothing to them.
 from __future__ import annotations
 
 import math
-from numbers import Real
+from numbers import Integral, Real
 from statistics import NormalDist
 
 import torch
@@ -363,9 +363,20 @@ def _solve_lower(factor: list[list[Tensor]], b: list[Tensor]) -> list[Tensor]:
     return x
 
 
+def check_count(name: str, value: int) -> None:
+    """Raise a ``ValueError`` unless ``value`` is an integer of at least 1."""
+    if isinstance(value, bool) or not isinstance(value, Integral) or value < 1:
+        raise ValueError(f"{name} must be an integer, at least 1, got {value!r}.")
+
+
+def is_number(value: object) -> bool:
+    """Whether ``value`` is a real number, which for Python a bool is, too."""
+    return isinstance(value, Real) and not isinstance(value, bool)
+
+
 def check_entropic_index(entropic_index: float) -> None:
     """Raise a ``ValueError`` unless ``entropic_index`` is a positive finite number."""
-    if not (isinstance(entropic_index, Real) and 0 < entropic_index < math.inf):
+    if not (is_number(entropic_index) and 0 < entropic_index < math.inf):
         raise ValueError(
             f"entropic_index must be a positive finite number, got {entropic_index!r}."
         )

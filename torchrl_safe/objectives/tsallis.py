@@ -21,7 +21,7 @@ from torchrl_safe.objectives.functional import (
     q_logarithm,
     uniform_tsallis_entropy,
 )
-from torchrl_safe.objectives.utils import ensemble
+from torchrl_safe.objectives.utils import as_given, ensemble
 from torchrl_safe.objectives.value import PolicyEvaluation, RetraceEstimator
 
 
@@ -153,14 +153,20 @@ class TsallisLoss(SACLoss):
     ) -> None:
         check_entropic_index(entropic_index)
         check_regression(loss_function, reduction or "mean")
-        if num_qvalue_nets < 1:
-            raise ValueError(f"num_qvalue_nets must be at least 1, got {num_qvalue_nets}.")
         if not alpha_init > 0:
             raise ValueError(f"alpha_init must be positive, got {alpha_init}.")
+        # With separate losses, copies of one network borrow what is the actor's.
+        borrows = separate_losses and not isinstance(qvalue_network, (list, tuple))
+        qvalue_network, expand_dim = as_given(
+            qvalue_network,
+            num_qvalue_nets,
+            names=("qvalue_network", "num_qvalue_nets"),
+            others=() if borrows else actor_network.parameters(),
+        )
         super().__init__(
             actor_network=actor_network,
             qvalue_network=qvalue_network,
-            num_qvalue_nets=num_qvalue_nets,
+            num_qvalue_nets=expand_dim,
             loss_function=loss_function,
             alpha_init=alpha_init,
             min_alpha=min_alpha,
@@ -177,6 +183,7 @@ class TsallisLoss(SACLoss):
             use_prioritized_weights=use_prioritized_weights,
             scalar_output_mode=scalar_output_mode,
         )
+        self.num_qvalue_nets = num_qvalue_nets
         self.entropic_index = entropic_index
 
     def _make_vmap(self) -> None:

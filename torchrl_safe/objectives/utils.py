@@ -1,27 +1,87 @@
-"""What the losses share: a network called with several sets of its parameters."""
+"""What the losses share: their critics, kept as they were given and called one by one or at once."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Iterable, Sequence
 
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
-from torchrl.modules import ValueOperator
-from torchrl.objectives.utils import _vmap_func
+from torch.func import functional_call
+from torch.nn.parameter import is_lazy
+from torchrl.objectives.utils import ValueEstimators
+from torchrl.objectives.value import ValueEstimatorBase
+
+from torchrl_safe.objectives.functional import check_count
 
 Ensemble = Callable[[TensorDictBase, TensorDictBase, NestedKey], Tensor]
-Place = tuple[dict[str, Any], str]
+
+
+def as_given(
+    network: TensorDictModule | Sequence[TensorDictModule],
+    count: int,
+    *,
+    names: tuple[str, str],
+    others: Iterable[nn.Parameter] = (),
+) -> tuple[TensorDictModule | list[TensorDictModule], int | None]:
+    """A critic as :meth:`~torchrl.objectives.LossModule.convert_to_functional` keeps it.
+
+    That method draws the weights of whatever it expands anew, also of a single copy, and what was
+    shared with other networks is then no longer shared. One network is therefore not expanded: the
+    loss trains the network itself, with its weights and with the layers that it shares. Several
+    copies of one network are expanded, as in TorchRL: their weights are drawn anew, apart from
+    each other. A list of networks is stacked, with the weights they have.
+
+    Args:
+        network (TensorDictModule or list of them): the critic.
+        count (int): number of networks.
+
+    Keyword Args:
+        names (tuple of str): of the two arguments of the loss, for errors.
+        others (iterable of Parameter): parameters of other networks of the loss, which copies
+            would not share with them.
+
+    Returns:
+        ``module`` and ``expand_dim``, arguments of
+        :meth:`~torchrl.objectives.LossModule.convert_to_functional`.
+
+    Raises:
+        ValueError: if ``count`` is no positive integer, a list has another length or its networks
+            are not of one kind, or copies would lose what is shared.
+    """
+    name, count_name = names
+    check_count(count_name, count)
+    networks = list(network) if isinstance(network, (list, tuple, nn.ModuleList)) else [network]
+    if networks != [network] and len(networks) != count:
+        raise ValueError(
+            f"{name}, a list of {len(networks)}, must have as many networks as {count_name} says, "
+            f"got {count_name}={count}."
+        )
+    if count == 1:
+        return networks[0], None
+    kinds = [
+        {key: None if is_lazy(p) else p.shape for key, p in each.state_dict().items()}
+        for each in networks
+    ]
+    if any(kind != kinds[0] for kind in kinds):
+        raise ValueError(f"{name}: networks of a list must have parameters of the same shapes.")
+    parameters = [id(p) for each in networks for p in each.parameters()]
+    if len(set(parameters)) < len(parameters) or not {id(p) for p in others}.isdisjoint(parameters):
+        raise ValueError(
+            f"{count_name}={count} makes copies, and {name} shares parameters with another network "
+            f"of the loss, which copies would not. Allowed are {count_name}=1, or networks of "
+            "their own."
+        )
+    return (network, count) if len(networks) == 1 else (networks, count)
 
 
 def ensemble(module: TensorDictModule, *, randomness: str, deactivate_vmap: bool) -> Ensemble:
     """A network as a function of its input, of E sets of parameters and of the output in question.
 
     Args:
-        module (TensorDictModule): the network.
+        module (TensorDictModule): the network. It is called as a module is, hooks included.
 
     Keyword Args:
         randomness (str): vmap's, ``"error"``, ``"different"`` or ``"same"``.
@@ -29,73 +89,61 @@ def ensemble(module: TensorDictModule, *, randomness: str, deactivate_vmap: bool
             this loop than TorchRL's: it stacks the output and nothing else.
 
     Returns:
-        A function of a tensordict ``[*B]``, parameters ``[E]``, stacked as
-        :meth:`~torchrl.objectives.LossModule.convert_to_functional` does it, and a key. It returns
-        what the module writes there, ``[E, *B, ...]``, and leaves its arguments alone. It raises
-        ``KeyError`` if the module does not write there.
+        A function of a tensordict ``[*B]``, of parameters as
+        :meth:`~torchrl.objectives.LossModule.convert_to_functional` makes them, ``[E]`` or, of one
+        network, without batch size, and of a key. It returns what the module writes there,
+        ``[E, *B, ...]``, and leaves its arguments alone. It raises ``KeyError`` if the module does
+        not write there.
     """
-    if not deactivate_vmap:
-        vmapped = _vmap_func(module, (None, 0), randomness=randomness)
-
-        def call_at_once(tensordict: TensorDictBase, params: TensorDictBase, key: NestedKey) -> Any:
-            return vmapped(tensordict.select(*module.in_keys, strict=False), params)[key]
-
-        return call_at_once
-    places = _places(module)
-    value_of = _value_of(module)
+    named = (*module.named_parameters(remove_duplicate=False),)
+    named += (*module.named_buffers(remove_duplicate=False),)
+    names = [name for name, _ in named]
+    paths = [tuple(name.split(".")) for name in names]
 
     def call(tensordict: TensorDictBase, params: TensorDictBase, key: NestedKey) -> Tensor:
-        leaves = [(*place, leaf.unbind(0)) for place, leaf in _pairs(places, params)]
-        own = [registry[name] for registry, name, _ in leaves]
-        values = []
-        try:
-            for i in range(len(params)):
-                for registry, name, members in leaves:
-                    registry[name] = members[i]
-                values.append(value_of(tensordict, key))
-        finally:
-            for (registry, name, _), tensor in zip(leaves, own, strict=True):
-                registry[name] = tensor
-        return torch.stack(values)
+        def value_of(*tensors: Tensor) -> Tensor:
+            inputs = tensordict.select(*module.in_keys, strict=False)
+            state = dict(zip(names, tensors, strict=True))
+            # A layer that is used twice is in the module twice, and has its weights twice.
+            return functional_call(module, state, (inputs,), tie_weights=False)[key]
+
+        tensors = [params.get(path) for path in paths]
+        if not params.batch_dims:
+            return value_of(*tensors).unsqueeze(0)
+        if deactivate_vmap:
+            members = zip(*(tensor.unbind(0) for tensor in tensors), strict=True)
+            return torch.stack([value_of(*member) for member in members])
+        return torch.vmap(value_of, randomness=randomness)(*tensors)
 
     return call
 
 
-def _value_of(module: TensorDictModule) -> Callable[[TensorDictBase, NestedKey], Tensor]:
-    """What a module writes at a key, as a function of what it reads.
+def find_value_type(
+    value_type: ValueEstimators | str | type[ValueEstimatorBase] | ValueEstimatorBase,
+    supported: Iterable[ValueEstimators | str],
+) -> ValueEstimators | str | type[ValueEstimatorBase] | ValueEstimatorBase:
+    """A value estimator by its name, in any case, as a member, a class or an instance.
 
-    A value operator is its network: to put one tensor into a tensordict and out again, for every
-    set of parameters, costs half as much as a small network.
+    Args:
+        value_type (ValueEstimators, str, class or instance): what a user asks for.
+        supported (iterable of ValueEstimators or str): members and names of the loss.
+
+    Returns:
+        The member or name of ``supported``, or the class or instance as it was given.
+
+    Raises:
+        ValueError: if it is none of them.
     """
-    direct = type(module) is ValueOperator and len(module.out_keys) == 1 and module._kwargs is None
-
-    def value_of(tensordict: TensorDictBase, key: NestedKey) -> Tensor:
-        if direct and key == module.out_keys[0]:
-            return module.module(*map(tensordict.get, module.in_keys))
-        return module(tensordict.select(*module.in_keys, strict=False))[key]
-
-    return value_of
-
-
-def _places(module: nn.Module) -> dict[str, Any]:
-    """Where a module keeps its parameters and buffers, nested like their tensordict.
-
-    To put tensors there is what :func:`torch.func.functional_call` does, too, after it has looked
-    for the place by its name, parameter by parameter and call by call.
-    """
-    own = {
-        name: (registry, name)
-        for registry in (module._parameters, module._buffers)
-        for name in registry
-    }
-    children = {name: child for name, child in module._modules.items() if child is not None}
-    return own | {name: _places(child) for name, child in children.items()}
-
-
-def _pairs(places: dict[str, Any], params: TensorDictBase) -> list[tuple[Place, Tensor]]:
-    """Places with what belongs there. ``params.items(True, True)`` takes twice as long."""
-    pairs: list[tuple[Place, Tensor]] = []
-    for name, value in params.items():
-        place = places[name]
-        pairs += _pairs(place, value) if isinstance(place, dict) else [(place, value)]
-    return pairs
+    by_name = {(kind if isinstance(kind, str) else kind.name).lower(): kind for kind in supported}
+    if isinstance(value_type, ValueEstimatorBase):
+        return value_type
+    if isinstance(value_type, type) and issubclass(value_type, ValueEstimatorBase):
+        return value_type
+    name = value_type.name if isinstance(value_type, ValueEstimators) else value_type
+    if isinstance(name, str) and name.lower() in by_name:
+        return by_name[name.lower()]
+    raise ValueError(
+        f"value_type must be one of {', '.join(map(repr, by_name))}, the member of "
+        f"ValueEstimators of that name, or a value estimator, class or instance, got "
+        f"{value_type!r}."
+    )

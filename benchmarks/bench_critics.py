@@ -27,7 +27,7 @@ def make_data(num_frames: int, observation_dim: int, action_dim: int) -> TensorD
         {
             "observation": torch.randn(num_frames, observation_dim),
             "action": torch.rand(num_frames, action_dim) * 2 - 1,
-            **dict(zip(("value_target", "cost_target", "std_target"), targets, strict=True)),
+            **dict(zip(("qvalue_target", "cost_target", "std_target"), targets, strict=True)),
         },
         [num_frames],
     )
@@ -77,7 +77,9 @@ def plain(cfg: DictConfig, env: SafeGoalEnv, data: TensorDict) -> Callable[[], N
     params = [p for each in networks for p in each.parameters()]
     optim = torch.optim.Adam(params, lr=cfg.optim.critic_lr, fused=True)
     inputs = torch.cat([data["observation"], data["action"]], -1)
-    targets = [data[name] for name in ("value_target", "value_target", "cost_target", "std_target")]
+    targets = [
+        data[name] for name in ("qvalue_target", "qvalue_target", "cost_target", "std_target")
+    ]
 
     def one_round() -> None:
         order = torch.randperm(len(inputs), device=cfg.device)

@@ -196,7 +196,7 @@ def with_targets(
 ) -> TensorDictBase:
     """Transitions of trajectories [B, T] with the targets of (4) and (18), flat."""
     policy = evaluate_policy(trajectories, actor, shifted=True)
-    names = ("value_target", "cost_target", "std_target")
+    names = ("qvalue_target", "cost_target", "std_target")
     targets = dict(zip(names, targets_of(trajectories, policy), strict=True))
     return trajectories.select("observation", "action").update(targets).flatten()
 

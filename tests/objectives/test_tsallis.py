@@ -221,8 +221,8 @@ class TestLossModule:
         torch.manual_seed(0)
         expected, _ = loss.qvalue_v2_loss(data)
         torch.manual_seed(0)
-        data["value_target"] = loss.compute_target(data)
-        flat = data.select("observation", "action", "value_target")
+        data["qvalue_target"] = loss.compute_target(data)
+        flat = data.select("observation", "action", "qvalue_target")
         torch.testing.assert_close(loss.qvalue_v2_loss(flat)[0], expected)
 
     def test_vmap_and_loop_agree(self, blocks):
@@ -253,7 +253,7 @@ class TestLossModule:
     def test_priority_weights(self, blocks):
         loss = TsallisLoss(*blocks, delay_qvalue=False)
         data = make_data()
-        data["value_target"] = loss.compute_target(data)
+        data["qvalue_target"] = loss.compute_target(data)
         data["priority_weight"] = torch.zeros(8)
         data["priority_weight"][2] = 1.0
         weighted, _ = loss.qvalue_v2_loss(data)
@@ -284,7 +284,7 @@ class TestLossModule:
         qvalue = make_qvalue("other_value").double()
         loss = TsallisLoss(actor, qvalue, delay_qvalue=False)
         loss.set_keys(
-            state_action_value="other_value", reward="bonus", value_target=("my", "target")
+            state_action_value="other_value", reward="bonus", qvalue_target=("my", "target")
         )
         loss.make_value_estimator(ValueEstimators.TD0, gamma=0.9)
         data = make_data()
@@ -493,7 +493,7 @@ class TestLossModule:
     def test_compiles(self, blocks):
         loss = TsallisLoss(*blocks, delay_qvalue=False, fixed_alpha=True, alpha_init=0.1)
         data = make_data()
-        data["value_target"] = loss.compute_target(data)
+        data["qvalue_target"] = loss.compute_target(data)
         compiled = torch.compile(lambda td: loss.qvalue_v2_loss(td)[0], backend="eager")
         torch.testing.assert_close(compiled(data), loss.qvalue_v2_loss(data)[0])
 
@@ -594,7 +594,7 @@ class TestAsUpstreamAsksOfALoss:
     def test_terms_compile_without_a_break(self, blocks, term):
         loss = TsallisLoss(*blocks, delay_qvalue=False, fixed_alpha=True, deactivate_vmap=True)
         data = make_data()
-        data["value_target"] = loss.compute_target(data)
+        data["qvalue_target"] = loss.compute_target(data)
         method = getattr(loss, term)
         compiled = torch.compile(lambda td: method(td)[0], backend="eager", fullgraph=True)
         torch.manual_seed(1)
@@ -633,7 +633,7 @@ class TestMisuse:
 
     def test_a_list_of_another_length(self, blocks):
         actor, qvalue = blocks
-        with pytest.raises(ValueError, match="as many networks as num_qvalue_nets says, got .*=2"):
+        with pytest.raises(ValueError, match=r"as many networks as num_qvalue_nets .*=2"):
             TsallisLoss(actor, [qvalue, make_qvalue(), make_qvalue()], num_qvalue_nets=2)
 
     def test_a_list_of_one_network_twice(self, blocks):
@@ -647,14 +647,16 @@ class TestMisuse:
         with pytest.raises(ValueError, match="qvalue_network: networks of a list must have"):
             TsallisLoss(actor, [qvalue, other])
 
-    def test_alpha(self, blocks):
-        with pytest.raises(ValueError, match=r"alpha_init must be positive, got -1"):
-            TsallisLoss(*blocks, alpha_init=-1.0)
+    @pytest.mark.parametrize("value", [-1.0, 0.0, math.inf, math.nan, True, "1"])
+    def test_alpha(self, blocks, value):
+        message = f"alpha_init must be a positive finite number, got {value!r}"
+        with pytest.raises(ValueError, match=message):
+            TsallisLoss(*blocks, alpha_init=value)
 
     def test_log_prob_shape(self, blocks):
         loss = TsallisLoss(*blocks, delay_qvalue=False)
         data = make_data()
         with pytest.raises(
-            ValueError, match=r"log_prob and the critic's value .* \(8, 1\) and \(8,\)"
+            ValueError, match=r"log_prob, a tensor, and the critic's value .* \(8, 1\) and \(8,\)"
         ):
             loss.objective(data, data["action"], data["action_log_prob"].unsqueeze(-1))

@@ -145,7 +145,7 @@ def learn(device: str, distance: Distance) -> dict[str, torch.Tensor]:
     out = {"log_prob": dist.log_prob(data["action"]), "action": dist.rsample(noise=noise)}
     out["mean"], out["cov"] = dist.moments
     evaluation = evaluate(make_data(), device)
-    out["value_target"] = reward_loss.compute_target(data, policy=evaluation)
+    out["qvalue_target"] = reward_loss.compute_target(data, policy=evaluation)
     out["cost_target"], out["std_target"] = cost_loss.compute_target(data, policy=evaluation)
     data.update({name: out[name] for name in ("value_target", "cost_target", "std_target")})
     losses = cost_loss(data)
@@ -195,7 +195,7 @@ def make_critics_update(device: str) -> Callable[[], None]:
     def update() -> None:
         evaluation = evaluate_policy(data, policy)
         part = data.copy()
-        part.set("value_target", reward_loss.compute_target(part, policy=evaluation))
+        part.set("qvalue_target", reward_loss.compute_target(part, policy=evaluation))
         cost_target, std_target = cost_loss.compute_target(part, policy=evaluation)
         part.update({"cost_target": cost_target, "std_target": std_target})
         losses = cost_loss(part)

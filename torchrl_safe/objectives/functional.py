@@ -38,14 +38,16 @@ def q_logarithm(log_prob: Tensor, entropic_index: float) -> Tensor:
 
     Above ``(q - 1) * log_prob = 10`` the exponential is continued by its tangent: the result
     stays increasing in ``log_prob``, and its gradient stays finite (at most ``exp(10)``) where
-    a squashed density grows without bound.
+    a squashed density grows without bound. Densities of 0 and of infinity have their limits:
+    ``-1 / (q - 1)`` for a density of 0 above ``q = 1``, ``1 / (1 - q)`` for one of infinity below.
 
     Args:
         log_prob (Tensor): log-density of any shape, ``[*B]``.
         entropic_index (float): ``q > 0``.
 
     Returns:
-        The q-logarithm, of the shape of ``log_prob``.
+        The q-logarithm, of the shape of ``log_prob``; in single precision where that is in half,
+        whose range and digits do not suffice.
 
     Raises:
         ValueError: if ``entropic_index`` is not a positive finite number.
@@ -61,11 +63,13 @@ def q_logarithm(log_prob: Tensor, entropic_index: float) -> Tensor:
     """
     check_entropic_index(entropic_index)
     order = entropic_index - 1.0
+    if log_prob.dtype in (torch.float16, torch.bfloat16):
+        log_prob = log_prob.float()
     if order == 0.0:
         return log_prob
     exponent = order * log_prob
     bounded = exponent.clamp(max=_MAX_EXPONENT)
-    excess = exponent - bounded
+    excess = torch.relu(exponent - _MAX_EXPONENT)  # not from `bounded`: inf - inf
     return (torch.expm1(bounded) + math.exp(_MAX_EXPONENT) * excess) / order
 
 
@@ -369,17 +373,41 @@ def check_count(name: str, value: int) -> None:
         raise ValueError(f"{name} must be an integer, at least 1, got {value!r}.")
 
 
-def is_number(value: object) -> bool:
-    """Whether ``value`` is a real number, which for Python a bool is, too."""
-    return isinstance(value, Real) and not isinstance(value, bool)
+def check_number(
+    name: str,
+    value: object,
+    *,
+    positive: bool = False,
+    least: float = -math.inf,
+    most: float = math.inf,
+    instead: str = "",
+) -> None:
+    """Raise a ``ValueError`` unless ``value`` is a finite number, in a range if there is one.
+
+    Args:
+        name (str): of the argument.
+        value (object): what it was given. A bool is no number.
+
+    Keyword Args:
+        positive (bool): it must be larger than 0.
+        least (float): it must be at least this.
+        most (float): it must be at most this.
+        instead (str): what is allowed besides, for the message.
+    """
+    is_number = isinstance(value, Real) and not isinstance(value, bool) and math.isfinite(value)
+    if is_number and least <= value <= most and (value > 0 or not positive):
+        return
+    low = f", at least {least:g}" if least > -math.inf else ""
+    high = f", at most {most:g}" if most < math.inf else ""
+    raise ValueError(
+        f"{name} must be {instead}a {'positive ' if positive else ''}finite number{low}{high}, got "
+        f"{value!r}."
+    )
 
 
 def check_entropic_index(entropic_index: float) -> None:
     """Raise a ``ValueError`` unless ``entropic_index`` is a positive finite number."""
-    if not (is_number(entropic_index) and 0 < entropic_index < math.inf):
-        raise ValueError(
-            f"entropic_index must be a positive finite number, got {entropic_index!r}."
-        )
+    check_number("entropic_index", entropic_index, positive=True)
 
 
 def check_risk_level(risk_level: float) -> None:

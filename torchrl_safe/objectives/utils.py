@@ -1,8 +1,9 @@
-"""What the losses share: their critics, kept as they were given and called one by one or at once."""
+"""What the losses share: critics, kept as they were given, one by one or at once; estimators."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
+from typing import Any, TypeAlias
 
 import torch
 from tensordict import TensorDictBase
@@ -11,12 +12,14 @@ from tensordict.utils import NestedKey
 from torch import Tensor, nn
 from torch.func import functional_call
 from torch.nn.parameter import is_lazy
-from torchrl.objectives.utils import ValueEstimators
+from torchrl.objectives import LossModule
+from torchrl.objectives.utils import ValueEstimators, build_value_estimator
 from torchrl.objectives.value import ValueEstimatorBase
 
-from torchrl_safe.objectives.functional import check_count
+from torchrl_safe.objectives.functional import check_count, check_number
 
 Ensemble = Callable[[TensorDictBase, TensorDictBase, NestedKey], Tensor]
+ValueType: TypeAlias = ValueEstimators | str | type[ValueEstimatorBase] | ValueEstimatorBase
 
 
 def as_given(
@@ -53,8 +56,9 @@ def as_given(
     """
     name, count_name = names
     check_count(count_name, count)
-    networks = list(network) if isinstance(network, (list, tuple, nn.ModuleList)) else [network]
-    if networks != [network] and len(networks) != count:
+    is_list = isinstance(network, (list, tuple, nn.ModuleList))
+    networks: list[Any] = list(network) if is_list else [network]
+    if is_list and len(networks) != count:
         raise ValueError(
             f"{name}, a list of {len(networks)}, must have as many networks as {count_name} says, "
             f"got {count_name}={count}."
@@ -74,7 +78,7 @@ def as_given(
             f"of the loss, which copies would not. Allowed are {count_name}=1, or networks of "
             "their own."
         )
-    return (network, count) if len(networks) == 1 else (networks, count)
+    return networks if is_list else network, count
 
 
 def ensemble(module: TensorDictModule, *, randomness: str, deactivate_vmap: bool) -> Ensemble:
@@ -118,32 +122,47 @@ def ensemble(module: TensorDictModule, *, randomness: str, deactivate_vmap: bool
     return call
 
 
-def find_value_type(
-    value_type: ValueEstimators | str | type[ValueEstimatorBase] | ValueEstimatorBase,
+def make_estimator(
+    loss: LossModule,
+    value_type: ValueType,
+    *,
     supported: Iterable[ValueEstimators | str],
-) -> ValueEstimators | str | type[ValueEstimatorBase] | ValueEstimatorBase:
-    """A value estimator by its name, in any case, as a member, a class or an instance.
+    **hyperparams: Any,
+) -> tuple[ValueEstimatorBase, ValueType]:
+    """The value estimator that a loss was asked for.
 
     Args:
-        value_type (ValueEstimators, str, class or instance): what a user asks for.
-        supported (iterable of ValueEstimators or str): members and names of the loss.
+        loss (LossModule): whose networks a class or a name is tied to; left as it is.
+        value_type (ValueEstimators, str, class or instance): a member or a name of ``supported``,
+            in any case; a class, or an instance, which is taken as it is.
+
+    Keyword Args:
+        supported (iterable of ValueEstimators or str): members and names that the loss takes.
+        **hyperparams: of the estimator.
 
     Returns:
-        The member or name of ``supported``, or the class or instance as it was given.
+        The estimator, and what the loss's ``value_type`` is then.
 
     Raises:
-        ValueError: if it is none of them.
+        ValueError: if ``value_type`` is none of these, or a discount is outside [0, 1].
     """
-    by_name = {(kind if isinstance(kind, str) else kind.name).lower(): kind for kind in supported}
     if isinstance(value_type, ValueEstimatorBase):
-        return value_type
+        return value_type, type(value_type)
+    for name in {"gamma", "lmbda"} & hyperparams.keys():
+        discount = hyperparams[name]
+        if isinstance(discount, Tensor) and discount.numel() == 1:
+            discount = discount.item()
+        check_number(name, discount, least=0, most=1)
+    # No network but what the loss writes: the value of the next state.
+    hyperparams = {"value_network": None, **hyperparams}
     if isinstance(value_type, type) and issubclass(value_type, ValueEstimatorBase):
-        return value_type
+        return value_type.for_loss(loss, **hyperparams), value_type
+    kinds = {(kind if isinstance(kind, str) else kind.name).lower(): kind for kind in supported}
     name = value_type.name if isinstance(value_type, ValueEstimators) else value_type
-    if isinstance(name, str) and name.lower() in by_name:
-        return by_name[name.lower()]
-    raise ValueError(
-        f"value_type must be one of {', '.join(map(repr, by_name))}, the member of "
-        f"ValueEstimators of that name, or a value estimator, class or instance, got "
-        f"{value_type!r}."
-    )
+    if not isinstance(name, str) or name.lower() not in kinds:
+        raise ValueError(
+            f"value_type must be one of {', '.join(map(repr, kinds))}, a member of ValueEstimators "
+            f"of such a name, or a value estimator, class or instance, got {value_type!r}."
+        )
+    kind = kinds[name.lower()]
+    return build_value_estimator(loss, kind, **hyperparams), kind

@@ -99,7 +99,10 @@ class Multiplier:
             ).to(cfg.device)
         elif kind == "lagrangian":
             self.module = LagrangeMultiplier(init=cfg.lagrangian.init).to(cfg.device)
-            self.optim = torch.optim.Adam(self.module.parameters(), lr=cfg.lagrangian.lr)
+            # With equal betas no step exceeds the rate, and a quiet time is soon forgotten.
+            self.optim = torch.optim.Adam(
+                self.module.parameters(), lr=cfg.lagrangian.lr, betas=(0.9, 0.9)
+            )
         else:
             raise ValueError(f"kind must be 'lagrangian' or 'pid', got {kind!r}.")
 

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import math
+
+import numpy as np
 import pytest
 import torch
 
@@ -22,7 +25,17 @@ class TestLagrangian:
         multiplier = LagrangeMultiplier()
         x = torch.ones(1, requires_grad=True)
         lagrangian(x.sum(), x, multiplier()).backward()
-        assert multiplier.weight.grad is None
+        assert multiplier.multiplier.grad is None
+
+    @pytest.mark.parametrize("value", [-0.5, math.inf, math.nan])
+    def test_a_multiplier_that_is_none(self, value):
+        with pytest.raises(ValueError, match=r"multiplier must be finite and at least 0, got \["):
+            lagrangian(torch.zeros(()), torch.zeros(2), torch.tensor([1.0, value]))
+
+    @pytest.mark.parametrize("value", [math.inf, -math.inf, math.nan])
+    def test_a_constraint_that_is_no_number(self, value):
+        with pytest.raises(ValueError, match=r"constraint must be finite, got \["):
+            lagrangian(torch.zeros(()), torch.tensor([value]), torch.zeros(1))
 
     @pytest.mark.parametrize(
         ("objective", "constraint", "multiplier"),
@@ -34,10 +47,10 @@ class TestLagrangian:
 
 
 class TestLagrangeMultiplier:
-    @pytest.mark.parametrize("init", [1e-6, 0.5, 50.0])
+    @pytest.mark.parametrize("init", [0, 1e-6, 0.5, 50.0])
     def test_starts_where_it_is_told(self, init):
         multiplier = LagrangeMultiplier(2, init=init)
-        torch.testing.assert_close(multiplier(), torch.full((2,), init), rtol=1e-4, atol=1e-7)
+        torch.testing.assert_close(multiplier(), torch.full((2,), float(init)), rtol=0, atol=0)
 
     def test_a_violation_raises_the_price(self):
         multiplier = LagrangeMultiplier(2)
@@ -51,10 +64,89 @@ class TestLagrangeMultiplier:
         other.load_state_dict(multiplier.state_dict())
         assert torch.equal(other(), multiplier())
 
-    @pytest.mark.parametrize("init", [0.0, -1.0, float("nan"), float("inf")])
+    @pytest.mark.parametrize("init", [-1.0, math.nan, math.inf, True, "1"])
     def test_bad_init(self, init):
-        with pytest.raises(ValueError, match="init must be positive and finite"):
+        with pytest.raises(ValueError, match="init must be a finite number, at least 0, got"):
             LagrangeMultiplier(init=init)
+
+
+OPTIMIZERS = {
+    "momentum": (torch.optim.SGD, {"momentum": 0.9}),
+    "nesterov": (torch.optim.SGD, {"momentum": 0.99, "nesterov": True}),
+    "adam": (torch.optim.Adam, {}),
+    "adam, one memory": (torch.optim.Adam, {"betas": (0.9, 0.9)}),
+    "adamw": (torch.optim.AdamW, {}),
+    "rmsprop": (torch.optim.RMSprop, {}),
+    "rprop": (torch.optim.Rprop, {}),
+}
+
+
+class TestNoWindUp:
+    """After any time of safety a violation is priced as projected dual ascent does."""
+
+    @pytest.mark.parametrize("scale", [0.1, 30.0])
+    def test_gradient_descent_is_projected_dual_ascent(self, scale):
+        rng, lr = np.random.default_rng(0), 0.05
+        constraints = scale * rng.normal(-0.5, 1.0, (3000, 2))
+        constraints[1000:2000] = -scale
+        multiplier, expected = LagrangeMultiplier(2), np.ones(2)
+        optim = torch.optim.SGD(multiplier.parameters(), lr=lr)
+        for constraint in constraints:
+            step(multiplier, optim, constraint)
+            expected = np.maximum(0.0, expected + lr * constraint)
+            np.testing.assert_allclose(multiplier().tolist(), expected, rtol=1e-4, atol=1e-4)
+
+    @pytest.mark.parametrize("depth", [0.5, 25.0])
+    @pytest.mark.parametrize("feasible", [300, 3000])
+    @pytest.mark.parametrize("name", OPTIMIZERS)
+    def test_a_price_after_safety(self, name, feasible, depth):
+        """However long and deep it was, a violation of 1 costs 0.5 after some 0.5 / lr steps."""
+        kind, options = OPTIMIZERS[name]
+        multiplier, lr = LagrangeMultiplier(), 0.02
+        optim = kind(multiplier.parameters(), lr=lr, **options)
+        for _ in range(feasible):
+            step(multiplier, optim, [-depth])
+        assert multiplier().item() == 0
+        count = 0
+        while multiplier().item() < 0.5:
+            step(multiplier, optim, [1.0])
+            count += 1
+            assert count <= 10 * 0.5 / lr
+
+    @pytest.mark.parametrize("depth", [0.5, 25.0])
+    @pytest.mark.parametrize("feasible", [300, 3000])
+    def test_adam_with_one_memory_steps_as_its_rate_says(self, feasible, depth):
+        multiplier, lr = LagrangeMultiplier(), 0.02
+        optim = torch.optim.Adam(multiplier.parameters(), lr=lr, betas=(0.9, 0.9))
+        for _ in range(feasible):
+            step(multiplier, optim, [-depth])
+        prices = [0.0]
+        for _ in range(100):
+            step(multiplier, optim, [1.0])
+            prices.append(multiplier().item())
+        rises = np.diff(prices)
+        assert (rises > 0).all()
+        assert rises.max() < lr * 1.01
+        assert prices[-1] == pytest.approx(100 * lr, rel=0.1)
+
+    def test_one_at_rest_does_not_hold_another(self):
+        multiplier = LagrangeMultiplier(2, init=0.0)
+        multiplier.loss(torch.tensor([-3.0, 2.0])).backward()
+        assert multiplier.multiplier.grad.tolist() == [0.0, -2.0]
+
+    def test_pid_unwinds_as_projected_ascent(self):
+        rng, ki = np.random.default_rng(1), 0.05
+        multiplier, expected = PIDMultiplier(kp=0.0, ki=ki), 0.0
+        for constraint in rng.normal(-0.3, 2.0, 500):
+            multiplier.update([constraint])
+            expected = max(0.0, expected + ki * constraint)
+            assert multiplier().item() == pytest.approx(expected, abs=1e-4)
+
+
+def step(multiplier, optim, constraint):
+    optim.zero_grad()
+    multiplier.loss(torch.tensor(constraint, dtype=torch.float32)).backward()
+    optim.step()
 
 
 @pytest.mark.parametrize(
@@ -98,9 +190,20 @@ class TestPIDMultiplier:
         error = torch.tensor([2.0, 0.5])
         assert torch.equal(first.update(error), second.update(error))
 
-    @pytest.mark.parametrize("bad", [torch.tensor([float("nan")]), torch.zeros(2)])
+    def test_holds_no_tensor_of_the_caller(self):
+        """The last constraint is remembered as it was, whatever becomes of the caller's tensor."""
+        constraint, multiplier = torch.tensor([1.0]), PIDMultiplier(kp=0.0, ki=0.0, kd=1.0)
+        multiplier.update(constraint)
+        constraint.fill_(-100.0)
+        assert multiplier.update(torch.tensor([3.0])).item() == 2.0  # the rise from 1
+        multiplier.load_state_dict(PIDMultiplier(kp=0.0, ki=0.0, kd=1.0).state_dict())
+        assert constraint.item() == -100.0
+
+    @pytest.mark.parametrize(
+        "bad", [torch.tensor([math.nan]), torch.zeros(2), torch.tensor([3.4e38])]
+    )
     def test_a_bad_constraint_changes_nothing(self, bad):
-        multiplier = PIDMultiplier(kp=1.0, ki=0.1)
+        multiplier = PIDMultiplier(kp=10.0, ki=0.1)
         multiplier.update(torch.tensor([1.0]))
         before = {key: value.clone() for key, value in multiplier.state_dict().items()}
         with pytest.raises(ValueError, match="constraint must"):
@@ -111,13 +214,13 @@ class TestPIDMultiplier:
     @pytest.mark.parametrize(
         ("arguments", "message"),
         [
-            ({"kp": -1.0, "ki": 0.0}, "kp must be at least 0"),
+            ({"kp": -1.0, "ki": 0.0}, "kp must be a finite number, at least 0"),
             ({"kp": 0.0, "ki": 0.0}, "must be positive"),
             ({"kp": 1.0, "ki": 0.0, "init": 1.0}, "needs a positive ki"),
-            ({"kp": 1.0, "ki": float("nan")}, "ki must be at least 0"),
+            ({"kp": 1.0, "ki": float("nan")}, "ki must be a finite number, at least 0"),
             (
                 {"num_constraints": 0, "kp": 1.0, "ki": 0.1},
-                "num_constraints, an integer, must be at least 1, got 0",
+                "num_constraints must be an integer, at least 1, got 0",
             ),
         ],
     )

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from numbers import Integral, Real
 from statistics import NormalDist
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -375,7 +376,7 @@ def check_count(name: str, value: int) -> None:
 
 def check_number(
     name: str,
-    value: object,
+    value: Any,
     *,
     positive: bool = False,
     least: float = -math.inf,
@@ -386,7 +387,7 @@ def check_number(
 
     Args:
         name (str): of the argument.
-        value (object): what it was given. A bool is no number.
+        value (Any): what it was given. A bool is no number.
 
     Keyword Args:
         positive (bool): it must be larger than 0.

@@ -7,12 +7,12 @@ A constraint is a number that is feasible at or below 0, as
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor, nn
+
+from torchrl_safe.objectives.functional import check_count, check_number
 
 __all__ = ["LagrangeMultiplier", "PIDMultiplier", "lagrangian"]
 
@@ -37,7 +37,8 @@ def lagrangian(objective: Tensor, constraint: Tensor, multiplier: Tensor) -> Ten
         The Lagrangian, a scalar, to be maximised.
 
     Raises:
-        ValueError: if shapes disagree.
+        ValueError: if shapes disagree, a multiplier is negative, or one or a constraint is not
+            finite. (Values are not looked at inside of :func:`torch.compile`.)
 
     Examples:
         >>> import torch
@@ -51,24 +52,45 @@ def lagrangian(objective: Tensor, constraint: Tensor, multiplier: Tensor) -> Ten
             f"{tuple(objective.shape)}, {tuple(constraint.shape)} and {tuple(multiplier.shape)}."
         )
     multiplier = multiplier.detach()
+    if not torch.compiler.is_compiling():
+        if not (multiplier.isfinite() & (multiplier >= 0)).all():
+            raise ValueError(
+                f"multiplier must be finite and at least 0, got {multiplier.tolist()}."
+            )
+        _check_finite(constraint)
     return (objective - (multiplier * constraint).sum()) / (1 + multiplier.sum())
 
 
 class LagrangeMultiplier(nn.Module):
-    r"""Multipliers that gradient ascent on the dual function learns.
+    r"""Multipliers that a torch optimizer moves up the dual function, projected.
 
-    :math:`\lambda = \mathrm{softplus}(w)` is positive for every weight, so that any torch
-    optimizer may own the weights, with momentum and a state of its own. SAC-Lagrangian (Ha et al.
+    .. math::
+
+        \lambda \leftarrow (\lambda + \eta c)_+
+
+    is projected dual ascent, and what :class:`torch.optim.SGD` does here. SAC-Lagrangian (Ha et al.
     2020, https://arxiv.org/abs/2002.08550) and WCSAC (Yang et al. 2021) constrain like this.
+
+    The parameter is :math:`\lambda` itself. :meth:`loss` puts a step that ended below 0 back to 0,
+    and has no gradient where a multiplier of 0 meets a constraint that holds: there it is at its
+    optimum. A time of safety therefore leaves nothing to wind back, neither in the multiplier nor
+    in the momentum of an optimizer, however long it was and however far inside the limit.
+
+    .. note::
+        Adam divides steps by a memory of gradients that lasts a thousand steps at its default
+        ``betas``: a price then rises several times slower after a steep fall, or faster after a
+        quiet time, than ``lr`` says. At ``betas=(0.9, 0.9)`` no step exceeds ``lr``, and both
+        memories last some ten steps.
 
     Args:
         num_constraints (int): m. Defaults to 1.
 
     Keyword Args:
-        init (float): multipliers to start with, positive. Defaults to 1.0.
+        init (float): multipliers to start with, at least 0. Defaults to 1.0.
 
     Raises:
-        ValueError: if ``num_constraints`` is not positive, or ``init`` is not positive and finite.
+        ValueError: if ``num_constraints`` is not a positive integer, or ``init`` is negative or not
+            finite.
 
     Examples:
         A weight of 2 prices ``max -x^2`` to where ``x >= 1`` holds:
@@ -77,7 +99,7 @@ class LagrangeMultiplier(nn.Module):
         >>> from torchrl_safe.objectives import LagrangeMultiplier, lagrangian
         >>> x, multiplier = torch.zeros(1, requires_grad=True), LagrangeMultiplier()
         >>> policy_optim = torch.optim.SGD([x], lr=0.1, maximize=True)
-        >>> multiplier_optim = torch.optim.Adam(multiplier.parameters(), lr=0.02)
+        >>> multiplier_optim = torch.optim.SGD(multiplier.parameters(), lr=0.05)
         >>> for _ in range(1000):
         ...     constraint = 1 - x
         ...     policy_optim.zero_grad()
@@ -92,17 +114,13 @@ class LagrangeMultiplier(nn.Module):
 
     def __init__(self, num_constraints: int = 1, *, init: float = 1.0) -> None:
         super().__init__()
-        _check_count(num_constraints)
-        if not 0 < init < math.inf:
-            raise ValueError(f"init must be positive and finite, got {init}.")
-        # The inverse of softplus, without overflow.
-        self.weight = nn.Parameter(
-            torch.full((num_constraints,), init + math.log(-math.expm1(-init)))
-        )
+        check_count("num_constraints", num_constraints)
+        check_number("init", init, least=0)
+        self.multiplier = nn.Parameter(torch.full((num_constraints,), float(init)))
 
     def forward(self) -> Tensor:
         """The multipliers, ``[m]``."""
-        return F.softplus(self.weight)
+        return self.multiplier.clamp(min=0)
 
     def loss(self, constraint: Tensor) -> Tensor:
         """What the multipliers' optimizer minimises: a violated constraint raises its price.
@@ -116,11 +134,15 @@ class LagrangeMultiplier(nn.Module):
         Raises:
             ValueError: if ``constraint`` has another shape or is not finite.
         """
-        return -(self() * _checked(constraint, self.weight)).sum()
+        constraint = _checked(constraint, self.multiplier)
+        with torch.no_grad():
+            self.multiplier.clamp_(min=0)
+            at_rest = (self.multiplier == 0) & (constraint <= 0)
+        return -(self.multiplier * constraint.masked_fill(at_rest, 0.0)).sum()
 
     def extra_repr(self) -> str:
         """Describe the module in ``repr``."""
-        return f"num_constraints={len(self.weight)}"
+        return f"num_constraints={len(self.multiplier)}"
 
 
 class PIDMultiplier(nn.Module):
@@ -177,10 +199,9 @@ class PIDMultiplier(nn.Module):
         init: float = 0.0,
     ) -> None:
         super().__init__()
-        _check_count(num_constraints)
+        check_count("num_constraints", num_constraints)
         for name, value in (("kp", kp), ("ki", ki), ("kd", kd), ("init", init)):
-            if not 0 <= value < math.inf:
-                raise ValueError(f"{name} must be at least 0 and finite, got {value}.")
+            check_number(name, value, least=0)
         if not kp + ki + kd > 0:
             raise ValueError("one of kp, ki and kd must be positive, got 0 for all of them.")
         if init > 0 and not ki > 0:
@@ -205,33 +226,37 @@ class PIDMultiplier(nn.Module):
             The new multipliers, ``[m]``.
 
         Raises:
-            ValueError: if ``constraint`` has another shape or is not finite; the state is then
-                left as it was.
+            ValueError: if ``constraint`` has another shape, is not finite or so large that a
+                multiplier would not be; the state is then left as it was.
         """
         error = _checked(constraint, self.multiplier)
         rise = torch.where(self.previous.isnan(), 0.0, error - self.previous).clamp(min=0)
-        self.integral = (self.integral + error).clamp(min=0)
-        self.previous = error
-        self.multiplier = (self.kp * error + self.ki * self.integral + self.kd * rise).clamp(min=0)
-        return self.multiplier
+        integral = (self.integral + error).clamp(min=0)
+        multiplier = (self.kp * error + self.ki * integral + self.kd * rise).clamp(min=0)
+        if not (integral.isfinite() & multiplier.isfinite()).all():
+            raise ValueError(
+                f"constraint must leave the multiplier finite, got {error.tolist()} at integral "
+                f"{self.integral.tolist()}."
+            )
+        self.integral, self.previous, self.multiplier = integral, error, multiplier
+        return multiplier
 
     def extra_repr(self) -> str:
         """Describe the module in ``repr``."""
         return f"num_constraints={len(self.multiplier)}, kp={self.kp}, ki={self.ki}, kd={self.kd}"
 
 
-def _check_count(num_constraints: int) -> None:
-    if not isinstance(num_constraints, int) or num_constraints < 1:
-        raise ValueError(f"num_constraints, an integer, must be at least 1, got {num_constraints}.")
-
-
 def _checked(constraint: Tensor | Sequence[float], like: Tensor) -> Tensor:
-    """A constraint without gradient, on the device and of the dtype of the multipliers."""
-    constraint = torch.as_tensor(constraint).detach().to(like)
+    """A copy of a constraint without gradient, on the device and of the dtype of multipliers."""
+    constraint = torch.as_tensor(constraint).detach().to(like, copy=True)
     if constraint.shape != like.shape:
         raise ValueError(
             f"constraint must have shape {tuple(like.shape)}, got {tuple(constraint.shape)}."
         )
+    _check_finite(constraint)
+    return constraint
+
+
+def _check_finite(constraint: Tensor) -> None:
     if not constraint.isfinite().all():
         raise ValueError(f"constraint must be finite, got {constraint.tolist()}.")
-    return constraint

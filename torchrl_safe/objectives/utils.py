@@ -156,13 +156,14 @@ def make_estimator(
     # No network but what the loss writes: the value of the next state.
     hyperparams = {"value_network": None, **hyperparams}
     if isinstance(value_type, type) and issubclass(value_type, ValueEstimatorBase):
-        return value_type.for_loss(loss, **hyperparams), value_type
+        estimator: Any = value_type
+        return estimator.for_loss(loss, **hyperparams), value_type
     kinds = {(kind if isinstance(kind, str) else kind.name).lower(): kind for kind in supported}
-    name = value_type.name if isinstance(value_type, ValueEstimators) else value_type
-    if not isinstance(name, str) or name.lower() not in kinds:
+    asked: Any = value_type.name if isinstance(value_type, ValueEstimators) else value_type
+    if not isinstance(asked, str) or asked.lower() not in kinds:
         raise ValueError(
             f"value_type must be one of {', '.join(map(repr, kinds))}, a member of ValueEstimators "
             f"of such a name, or a value estimator, class or instance, got {value_type!r}."
         )
-    kind = kinds[name.lower()]
+    kind = kinds[asked.lower()]
     return build_value_estimator(loss, kind, **hyperparams), kind

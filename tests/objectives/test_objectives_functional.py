@@ -63,7 +63,47 @@ class TestQLogarithm:
         assert grad.max() <= math.exp(10) * (1 + 1e-6)
         assert grad.min() > 0
 
-    @pytest.mark.parametrize("entropic_index", [0.0, -1.0, math.nan, math.inf])
+    @pytest.mark.parametrize("entropic_index", [0.3, 0.9, 1.2, 2.0, 7.0])
+    def test_limits(self, entropic_index):
+        """Densities of 0 and infinity, and those on the way there, have finite gradients."""
+        order = entropic_index - 1
+        limits = [-1 / order, math.inf] if order > 0 else [-math.inf, -1 / order]
+        log_prob = torch.tensor([-math.inf, -1e30, -300.0, 300.0, 1e30, math.inf]).double()
+        log_prob.requires_grad_()
+        value = q_logarithm(log_prob, entropic_index)
+        (grad,) = torch.autograd.grad(value.sum(), log_prob)
+        assert [value[0].item(), value[-1].item()] == pytest.approx(limits)
+        assert not value.isnan().any()
+        assert grad.isfinite().all()
+        assert grad.min() >= 0
+        bounded = 2 if order > 0 else 3  # exact where the tangent is not reached
+        expected = exact_q_logarithm(log_prob[bounded].item(), entropic_index)
+        assert value[bounded].item() == pytest.approx(expected, rel=1e-12)
+
+    def test_gradient_where_the_tangent_begins(self):
+        log_prob = torch.tensor(10.0, requires_grad=True)
+        q_logarithm(log_prob, 2.0).backward()
+        assert log_prob.grad.item() == pytest.approx(math.exp(10), rel=1e-6)
+
+    @pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
+    @pytest.mark.parametrize("entropic_index", [0.5, 1.0, 1.2, 2.0])
+    def test_half_precision(self, entropic_index, dtype):
+        """As exact as the log-density that is given, also beyond the range of half precision."""
+        log_prob = torch.tensor([-20.0, -3.3, -0.01, 0.01, 2.7, 9.5, 30.0], dtype=dtype)
+        log_prob.requires_grad_()
+        value = q_logarithm(log_prob, entropic_index)
+        reachable = (entropic_index - 1) * log_prob.detach().double() <= 10
+        expected = torch.tensor([exact_q_logarithm(x, entropic_index) for x in log_prob.tolist()])
+        torch.testing.assert_close(
+            value.detach()[reachable], expected[reachable], rtol=1e-5, atol=0
+        )
+        value.sum().backward()
+        assert value.isfinite().all()
+        assert log_prob.grad.isfinite().all()
+
+    @pytest.mark.parametrize(
+        "entropic_index", [0.0, -1.0, math.nan, math.inf, True, torch.ones(())]
+    )
     def test_bad_index(self, entropic_index):
         with pytest.raises(ValueError, match=r"entropic_index must be .* got"):
             q_logarithm(torch.zeros(1), entropic_index)

@@ -1,20 +1,23 @@
 from __future__ import annotations
 
+import functools
 import math
 from copy import deepcopy
 
 import pytest
 import torch
 from tensordict import TensorDict
-from tensordict.nn import TensorDictModule
+from tensordict.nn import CompositeDistribution, TensorDictModule, set_composite_lp_aggregate
 from torch import nn
 from torchrl.data import Bounded, Composite, MultiStep
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.modules import MLP, NormalParamExtractor, ProbabilisticActor, TanhNormal, ValueOperator
+from torchrl.modules.distributions.utils import rsample_and_log_prob
 from torchrl.objectives import SACLoss, SoftUpdate, ValueEstimators
+from torchrl.objectives.value import GAE, TD0Estimator, TD1Estimator, TDLambdaEstimator
 from torchrl.testing import get_default_devices
 
-from torchrl_safe import GMMTanhPolicy, TsallisLoss
+from torchrl_safe import GMMTanhPolicy, RetraceEstimator, TsallisLoss
 from torchrl_safe.modules import GMMParamExtractor
 
 OBS, ACT = 3, 2
@@ -496,6 +499,341 @@ class TestLossModule:
         data["qvalue_target"] = loss.compute_target(data)
         compiled = torch.compile(lambda td: loss.qvalue_v2_loss(td)[0], backend="eager")
         torch.testing.assert_close(compiled(data), loss.qvalue_v2_loss(data)[0])
+
+
+class TestEntropicIndex:
+    """It may be changed: what follows from it follows."""
+
+    @pytest.fixture
+    def make(self, blocks):
+        def make(index, **options):
+            return TsallisLoss(*blocks, entropic_index=index, delay_qvalue=False, **options)
+
+        return make
+
+    @pytest.mark.parametrize("read_first", [False, True])
+    def test_it_is_set(self, make, read_first):
+        loss, data = make(1.0), make_data()
+        if read_first:
+            assert loss.target_entropy == -ACT
+        for index in (2.0, 1.5):  # scheduled
+            loss.entropic_index = index
+            volume = math.exp(-ACT)
+            expected = (1 - volume ** (1 - index)) / (index - 1)
+            assert loss.target_entropy.item() == pytest.approx(expected, rel=1e-5)
+        fresh = make(1.5)
+        fresh.load_state_dict(loss.state_dict())
+        outs = []
+        for each in (loss, fresh):
+            torch.manual_seed(1)
+            outs.append(each(data))
+        for key in outs[0].keys():
+            assert torch.equal(outs[0][key], outs[1][key])
+
+    def test_it_is_loaded(self, make):
+        saved, loss = make(1.2), make(1.7)
+        loss.load_state_dict(saved.state_dict())
+        assert loss.entropic_index == 1.2
+        assert torch.equal(loss.target_entropy, saved.target_entropy)
+        loss.entropic_index = 1.7
+        assert torch.equal(loss.target_entropy, make(1.7).target_entropy)
+
+    def test_a_target_that_was_given_stays(self, make):
+        loss = make(1.2, target_entropy=-0.3)
+        loss.entropic_index = 2.0
+        other = make(3.0, target_entropy=-0.3)
+        other.load_state_dict(loss.state_dict())
+        for each in (loss, other):
+            assert each.entropic_index == 2.0
+            assert each.target_entropy.item() == pytest.approx(-0.3)
+
+    @pytest.mark.parametrize("index", [0.0, -3, math.nan, math.inf, True, "2", torch.ones(())])
+    def test_it_is_checked(self, make, index):
+        loss = make(1.2)
+        before = loss.target_entropy.clone()
+        with pytest.raises(ValueError, match="entropic_index must be a positive finite number"):
+            loss.entropic_index = index
+        assert loss.entropic_index == 1.2
+        assert torch.equal(loss.target_entropy, before)
+
+
+class TestValueEstimators:
+    BY_NAME = (
+        ("td0", TD0Estimator),
+        ("TD0", TD0Estimator),
+        ("TDLambda", TDLambdaEstimator),
+        ("tdlambda", TDLambdaEstimator),
+        ("td1", TD1Estimator),
+        ("retrace", RetraceEstimator),
+        ("RETRACE", RetraceEstimator),
+        (ValueEstimators.TDLambda, TDLambdaEstimator),
+        (TD0Estimator, TD0Estimator),
+        (RetraceEstimator, RetraceEstimator),
+        (None, TD0Estimator),
+    )
+
+    @pytest.mark.parametrize(("value_type", "kind"), BY_NAME)
+    def test_by_name_member_and_class(self, blocks, value_type, kind):
+        """Any spelling gives the same target, under keys that were set before or after."""
+        data = make_data((4, 6))
+        data["next", "bonus"] = data["next"].pop("reward")
+        hyperparams = {"gamma": 0.8}
+        if kind in (TDLambdaEstimator, RetraceEstimator):
+            hyperparams["lmbda"] = 0.5
+        targets = []
+        for keys_first in (False, True):
+            torch.manual_seed(0)
+            loss = TsallisLoss(*blocks, delay_qvalue=False)
+            if keys_first:
+                loss.set_keys(reward="bonus")
+            assert loss.make_value_estimator(value_type, **hyperparams) is loss
+            assert type(loss.value_estimator) is kind
+            loss.set_keys(reward="bonus")
+            torch.manual_seed(5)
+            targets.append(loss.compute_target(data))
+        torch.manual_seed(0)
+        loss = TsallisLoss(*blocks, delay_qvalue=False)
+        if kind is RetraceEstimator:
+            estimator = RetraceEstimator.for_loss(loss, **hyperparams)
+        else:
+            estimator = kind(value_network=None, **hyperparams)
+        loss.make_value_estimator(estimator)
+        assert loss.value_estimator is estimator
+        loss.set_keys(reward="bonus")
+        torch.manual_seed(5)
+        targets.append(loss.compute_target(data))
+        for target in targets[1:]:
+            assert torch.equal(target, targets[0])
+
+    @pytest.mark.parametrize("value_type", ["gae", "td", ValueEstimators.GAE, 3, nn.Linear])
+    def test_of_an_unknown_kind(self, blocks, value_type):
+        loss = TsallisLoss(*blocks)
+        before = loss.value_estimator, loss.value_type
+        message = "value_type must be one of 'td0', 'td1', 'tdlambda', 'retrace', .* got"
+        with pytest.raises(ValueError, match=message):
+            loss.make_value_estimator(value_type)
+        assert (loss.value_estimator, loss.value_type) == before
+
+    @pytest.mark.parametrize("estimator", ["td0", "tdlambda", "retrace"])
+    @pytest.mark.parametrize("dtype", [torch.int64, torch.int8, torch.bool])
+    def test_rewards_that_are_no_floats(self, blocks, estimator, dtype):
+        loss = TsallisLoss(*blocks, delay_qvalue=False)
+        loss.make_value_estimator(estimator, gamma=0.9)
+        data = make_data((4, 6))
+        data["next", "reward"] = (data["next", "reward"] > 0).to(dtype)
+        torch.manual_seed(5)
+        target = loss.compute_target(data)
+        assert data["next", "reward"].dtype == dtype
+        data["next", "reward"] = data["next", "reward"].double()
+        torch.manual_seed(5)
+        torch.testing.assert_close(target, loss.compute_target(data))
+
+    @pytest.mark.parametrize("estimator", ["td0", "tdlambda", "retrace"])
+    @pytest.mark.parametrize("end", ["done", "terminated"])
+    def test_nan_behind_an_end(self, blocks, estimator, end):
+        """The state before it takes its place; what has terminated does not look at it."""
+        loss = TsallisLoss(*blocks, delay_qvalue=False)
+        loss.make_value_estimator(estimator, gamma=0.9)
+        data = make_data((4, 6))
+        data["next", "done"][:, 2] = True
+        data["next", end][:, 2] = True
+        plain = data.clone()
+        plain["next", "observation"][:, 2] = plain["observation"][:, 2]
+        data["next", "observation"][:, 2] = math.nan
+        torch.manual_seed(5)
+        target = loss.compute_target(data)
+        torch.manual_seed(5)
+        assert torch.equal(target, loss.compute_target(plain))
+        assert data["next", "observation"][:, 2].isnan().all()
+        if end == "terminated":
+            torch.testing.assert_close(target[:, 2], data["next", "reward"][:, 2])
+
+    def test_a_value_target_of_others_is_not_read(self, blocks):
+        loss = TsallisLoss(*blocks, delay_qvalue=False)
+        data = make_data((4, 6))
+        torch.manual_seed(5)
+        expected, _ = loss.qvalue_v2_loss(data)
+        state_value = ValueOperator(MLP(OBS, 1, num_cells=[4]).double())
+        GAE(gamma=0.9, lmbda=0.9, value_network=state_value)(data)
+        assert "value_target" in data.keys()
+        torch.manual_seed(5)
+        assert torch.equal(loss.qvalue_v2_loss(data)[0], expected)
+
+
+class TestMasks:
+    @pytest.mark.parametrize("shape", [(4, 6), (4, 6, 1)])
+    def test_padding_counts_nowhere(self, blocks, shape):
+        """Losses and entropy are means over the steps that the mask keeps."""
+        loss = TsallisLoss(*blocks, delay_qvalue=False)
+        data = make_data((4, 6))
+        data["qvalue_target"] = loss.compute_target(data)
+        mask = torch.ones(4, 6, dtype=torch.bool)
+        mask[1, 4:] = mask[3, 1:] = False
+        data["observation"][~mask] = 30.0
+        data["collector", "mask"] = mask.view(shape)
+        torch.manual_seed(1)
+        out = loss(data)
+        torch.manual_seed(1)
+        log_prob = loss.actor_loss(data)[1]["log_prob"]
+        torch.testing.assert_close(out["entropy"], -log_prob[mask].mean())
+        expected = -(loss.log_alpha * (log_prob[mask] + loss.target_entropy)).mean()
+        torch.testing.assert_close(out["loss_alpha"], expected)
+        valid = data[mask].exclude("collector")
+        torch.testing.assert_close(out["loss_qvalue"], loss.qvalue_v2_loss(valid)[0])
+
+
+class TestActions:
+    def test_parts_of_a_composite_action(self):
+        """The density is the joint one: the product of those of the parts."""
+        torch.manual_seed(0)
+        q, alpha = 1.7, 0.3
+        actor, qvalue = make_composite_actor(), make_composite_critic()
+        loss = TsallisLoss(
+            actor,
+            qvalue,
+            entropic_index=q,
+            alpha_init=alpha,
+            action_spec=COMPOSITE_SPEC,
+            delay_qvalue=False,
+            num_qvalue_nets=1,
+        )
+        assert loss.target_entropy.item() == pytest.approx((1 - math.exp(5 * (q - 1))) / (q - 1))
+        loss.make_value_estimator("td0", gamma=0.9)
+        data = make_data((4, 6))
+        data["action"] = actor.get_dist(data).sample()
+
+        def value_and_log_q(states):
+            params = actor.module[0](states.select("observation"))["params"]
+            action = actor.get_dist(states).sample()
+            log_prob = sum(
+                TanhNormal(**params[part].to_dict()).log_prob(action[part]) for part in ("a", "b")
+            )
+            inputs = [states["observation"], action["a"], action["b"]]
+            value = qvalue.module.net(torch.cat(inputs, -1)).squeeze(-1)
+            return value, (log_prob.exp() ** (q - 1) - 1) / (q - 1)
+
+        close = {"rtol": 1e-5, "atol": 1e-6}  # the inverse of tanh
+        torch.manual_seed(1)
+        target = loss.compute_target(data)
+        torch.manual_seed(1)
+        value, log_q = value_and_log_q(data["next"])
+        following = (value - alpha * log_q).unsqueeze(-1) * ~data["next", "terminated"]
+        torch.testing.assert_close(target, data["next", "reward"] + 0.9 * following, **close)
+        torch.manual_seed(1)
+        actor_loss, metadata = loss.actor_loss(data)
+        torch.manual_seed(1)
+        value, log_q = value_and_log_q(data)
+        torch.testing.assert_close(metadata["log_prob"], log_q, **close)
+        torch.testing.assert_close(actor_loss, (alpha * log_q - value).mean(), **close)
+        out = loss(data)
+        (out["loss_actor"] + out["loss_qvalue"] + out["loss_alpha"]).backward()
+        assert all(p.grad is not None for p in loss.parameters())
+
+        # Retrace without traces is TD(0), also of composite actions.
+        loss.make_value_estimator("retrace", gamma=0.9, lmbda=0.0)
+        torch.manual_seed(1)
+        torch.testing.assert_close(loss.compute_target(data), target)
+
+    def test_densities_of_parts_are_refused(self):
+        actor = make_composite_actor()
+        loss = TsallisLoss(actor, make_composite_critic(), delay_qvalue=False)
+        data = make_data()
+        action, parts = rsample_and_log_prob(actor.get_dist(data))
+        with pytest.raises(ValueError, match=r"log_prob, a tensor, .* got TensorDict"):
+            loss.objective(data, action, parts)
+        with set_composite_lp_aggregate(True):
+            action, log_prob = rsample_and_log_prob(actor.get_dist(data))
+        assert loss.objective(data, action, log_prob).shape == (8,)
+
+    @pytest.mark.parametrize("estimator", ["td0", "retrace"])
+    def test_matrices(self, estimator):
+        """A matrix of four actions is the vector of the four."""
+        data, outs = make_data((4, 6)), []
+        data["action"] = torch.rand(4, 6, 4).double()
+        for matrix in (False, True):
+            torch.manual_seed(0)
+            shape = (2, 2) if matrix else (4,)
+            net = nn.Sequential(MLP(OBS, 8, num_cells=[16]), NormalParamExtractor()).double()
+            actor = ProbabilisticActor(
+                TensorDictModule(_Shaped(net, shape), ["observation"], ["loc", "scale"]),
+                in_keys=["loc", "scale"],
+                spec=Bounded(-1, 1, shape, dtype=torch.float64),
+                distribution_class=TanhNormal,
+                distribution_kwargs={"event_dims": len(shape)},
+            )
+            critic = _Flat(MLP(OBS + 4, 1, num_cells=[16]).double())
+            qvalue = ValueOperator(critic, in_keys=["observation", "action"])
+            loss = TsallisLoss(actor, qvalue, delay_qvalue=False)
+            loss.make_value_estimator(estimator, gamma=0.9)
+            inputs = data.clone()
+            inputs["action"] = data["action"].unflatten(-1, shape)
+            torch.manual_seed(1)
+            outs.append(loss(inputs))
+        for key in outs[0].keys():
+            torch.testing.assert_close(outs[0][key], outs[1][key])
+
+
+class _Shaped(nn.Module):
+    def __init__(self, net, shape):
+        super().__init__()
+        self.net, self.shape = net, shape
+
+    def forward(self, observation):
+        return tuple(x.unflatten(-1, self.shape) for x in self.net(observation))
+
+
+class _Flat(nn.Module):
+    def __init__(self, net):
+        super().__init__()
+        self.net = net
+
+    def forward(self, observation, action):
+        return self.net(torch.cat([observation, action.reshape(*observation.shape[:-1], -1)], -1))
+
+
+class _Parts(nn.Module):
+    """Locations and scales of an action of two parts, of two and of three dimensions."""
+
+    def __init__(self):
+        super().__init__()
+        self.net = nn.Sequential(nn.Linear(OBS, 10), NormalParamExtractor())
+
+    def forward(self, observation):
+        loc, scale = self.net(observation)
+        return loc[..., :2], scale[..., :2], loc[..., 2:], scale[..., 2:]
+
+
+COMPOSITE_SPEC = Composite(
+    action=Composite(
+        a=Bounded(-1, 1, (2,), dtype=torch.float64), b=Bounded(-1, 1, (3,), dtype=torch.float64)
+    )
+)
+
+
+def make_composite_actor():
+    keys = [("params", part, name) for part in ("a", "b") for name in ("loc", "scale")]
+    return ProbabilisticActor(
+        TensorDictModule(_Parts().double(), ["observation"], keys),
+        in_keys=["params"],
+        out_keys=["action"],
+        spec=COMPOSITE_SPEC,
+        distribution_class=functools.partial(
+            CompositeDistribution, distribution_map={"a": TanhNormal, "b": TanhNormal}
+        ),
+    )
+
+
+class _OfParts(nn.Module):
+    def __init__(self):
+        super().__init__()
+        self.net = MLP(OBS + 5, 1, num_cells=[8]).double()
+
+    def forward(self, observation, action):
+        return self.net(torch.cat([observation, action["a"], action["b"]], -1))
+
+
+def make_composite_critic():
+    return TensorDictModule(_OfParts(), ["observation", "action"], ["state_action_value"])
 
 
 class TestAsUpstreamAsksOfALoss:

@@ -147,7 +147,7 @@ def learn(device: str, distance: Distance) -> dict[str, torch.Tensor]:
     evaluation = evaluate(make_data(), device)
     out["qvalue_target"] = reward_loss.compute_target(data, policy=evaluation)
     out["cost_target"], out["std_target"] = cost_loss.compute_target(data, policy=evaluation)
-    data.update({name: out[name] for name in ("value_target", "cost_target", "std_target")})
+    data.update({name: out[name] for name in ("qvalue_target", "cost_target", "std_target")})
     losses = cost_loss(data)
     losses["loss_qvalue"], _ = reward_loss.qvalue_v2_loss(data)
     sum(losses[f"loss_{name}"] for name in ("qvalue", "cost_value", "cost_std")).backward()

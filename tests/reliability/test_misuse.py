@@ -172,6 +172,7 @@ def return_surrogate() -> ReturnSurrogateLoss:
 for make in (policy, tsallis, cvar, surrogate, return_surrogate):
     make()
 SoftUpdate(tsallis(), tau=0.5)  # without, TorchRL warns
+tsallis().make_value_estimator("td0", gamma=0.9)
 
 
 def data(*without: str) -> TensorDict:
@@ -195,7 +196,7 @@ def weights(module: Callable[[], nn.Module]) -> Callable[[], Any]:
 
 # The equations.
 
-q_values = (0, -1.0, NAN, INF, "two")
+q_values = (0, -1.0, NAN, INF, "two", True, torch.ones(()))
 each("q_logarithm", partial(F.q_logarithm, zeros(3)), "entropic_index", q_values, "positive finite")
 each(
     "uniform_tsallis_entropy",
@@ -284,8 +285,18 @@ bad(
 
 # Multipliers.
 
-each("LagrangeMultiplier", LagrangeMultiplier, "num_constraints", (0, -1, 1.5), "at least 1")
-each("LagrangeMultiplier", LagrangeMultiplier, "init", (0.0, -1.0, NAN, INF), "positive and finite")
+priced = partial(lagrangian, zeros(), constraint=zeros(2), multiplier=zeros(2))
+for name, wrong, allowed in (
+    ("multiplier", [1.0, -2.0], "finite and at least 0"),
+    ("multiplier", [1.0, INF], "finite and at least 0"),
+    ("constraint", [NAN, 1.0], "finite"),
+):
+    call = partial(priced, **{name: torch.tensor(wrong)})
+    bad(f"lagrangian: {name}={wrong}", call, ValueError, name, str(wrong), allowed)
+counts = (0, -1, 1.5, True)
+each("LagrangeMultiplier", LagrangeMultiplier, "num_constraints", counts, "integer, at least 1")
+at_least_0 = "a finite number, at least 0"
+each("LagrangeMultiplier", LagrangeMultiplier, "init", (-1.0, NAN, INF, "1"), at_least_0)
 multiplier = cache(LagrangeMultiplier)
 pid = cache(lambda: PIDMultiplier(2, kp=1.0, ki=0.1))
 for name, owner, call in (
@@ -314,7 +325,7 @@ for name, owner, call in (
 make_pid = partial(PIDMultiplier, kp=1.0, ki=1.0)
 each("PIDMultiplier", make_pid, "num_constraints", (0, 1.5), "at least 1")
 for name in ("kp", "ki", "kd", "init"):
-    each("PIDMultiplier", make_pid, name, (-1.0, NAN, INF), "at least 0 and finite")
+    each("PIDMultiplier", make_pid, name, (-1.0, NAN, INF, True), at_least_0)
 bad(
     "PIDMultiplier: gains", lambda: PIDMultiplier(kp=0.0, ki=0.0), ValueError, "ki", "0", "positive"
 )
@@ -330,8 +341,81 @@ bad(
 # Losses.
 
 each("TsallisLoss", make_tsallis, "entropic_index", q_values, "positive finite")
-each("TsallisLoss", make_tsallis, "num_qvalue_nets", (0, -2), "at least 1")
-each("TsallisLoss", make_tsallis, "alpha_init", (0.0, -1.0, NAN), "positive")
+bad(
+    "TsallisLoss.entropic_index: set",
+    lambda: setattr(tsallis(), "entropic_index", -3.0),
+    ValueError,
+    "entropic_index",
+    "-3.0",
+    "positive finite",
+    state=weights(tsallis),
+)
+each("TsallisLoss", make_tsallis, "num_qvalue_nets", counts, "integer, at least 1")
+each("TsallisLoss", make_tsallis, "alpha_init", (0.0, -1.0, NAN, INF, True), "positive finite")
+each("TsallisLoss", make_tsallis, "max_alpha", (0.0, NAN, "1"), "positive finite")
+each("TsallisLoss", make_tsallis, "min_alpha", (-1.0, NAN, INF), at_least_0)
+each("TsallisLoss", partial(make_tsallis, max_alpha=0.5), "min_alpha", (0.7,), "most max_alpha=0.5")
+each("TsallisLoss", make_tsallis, "target_entropy", (NAN, "max", True), "'auto' or a finite number")
+each("TsallisLoss", make_tsallis, "scalar_output_mode", ("mean",), "'exclude' or 'non_tensor'")
+bad(
+    "TsallisLoss: an actor of two densities",
+    lambda: TsallisLoss(two_densities(), critic("state_action_value")),
+    ValueError,
+    "actor_network",
+    "log_prob_keys=",
+    "one log-density",
+)
+for value_type in ("gae", "td", 3, ValueEstimators.GAE, nn.Linear):
+    bad(
+        f"TsallisLoss.make_value_estimator: {value_type!r}",
+        partial(tsallis().make_value_estimator, value_type),
+        ValueError,
+        "value_type",
+        repr(value_type),
+        "'td0', 'td1', 'tdlambda', 'retrace'",
+        state=lambda: (tsallis().value_type, tsallis().state_dict()),
+    )
+each(
+    "TsallisLoss.make_value_estimator",
+    tsallis().make_value_estimator,
+    "gamma",
+    (-0.1, 1.5, NAN, "one"),
+    "at least 0, at most 1",
+)
+for key, says in (
+    (("next", "reward"), "the reward"),
+    (("next", "done"), "the end of trajectories"),
+    ("action", "an input of qvalue_network"),
+):
+    bad(
+        f"TsallisLoss: no {key}",
+        lambda key=key: tsallis()(data(key)),
+        KeyError,
+        repr(key[-1] if isinstance(key, tuple) else key),
+        says,
+        "is not in the tensordict",
+        state=weights(tsallis),
+    )
+flat_reward = data()
+flat_reward["next", "reward"] = zeros(2, 4)
+bad(
+    "TsallisLoss: a reward without feature",
+    lambda: tsallis()(flat_reward),
+    ValueError,
+    "'reward'",
+    "got (2, 4)",
+    "a last dimension of 1",
+    state=weights(tsallis),
+)
+bad(
+    "TsallisLoss: a target without feature",
+    lambda: tsallis()(data().set("qvalue_target", zeros(2, 4))),
+    ValueError,
+    "'qvalue_target'",
+    "got (2, 4)",
+    "(2, 4, 1)",
+    state=weights(tsallis),
+)
 each("CVaRCostLoss", make_cvar, "cost_limit", (-1.0, NAN, INF), "finite and at least 0")
 each("CVaRCostLoss", make_cvar, "risk_level", risk_levels, "in (0, 1]")
 each("CVaRCostLoss", make_cvar, "num_cost_nets", (0,), "at least 1")

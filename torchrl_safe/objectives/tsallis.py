@@ -443,6 +443,17 @@ class TsallisLoss(SACLoss):
         reward = get_entry(next_tensordict, keys.reward, "the reward")
         done = get_entry(next_tensordict, keys.done, "the end of trajectories")
         terminated = next_tensordict.get(keys.terminated, done)
+        if reward.shape[-1:] != (1,) or reward.ndim <= tensordict.ndim:
+            raise ValueError(
+                f"{keys.reward!r} must have a last dimension of 1 besides those of the batch, "
+                f"{tuple(tensordict.batch_size)}, got {tuple(reward.shape)}; unsqueeze it."
+            )
+        for key, flag in ((keys.done, done), (keys.terminated, terminated)):
+            if flag.shape != reward.shape:
+                raise ValueError(
+                    f"{key!r} must have the shape of {keys.reward!r}, {tuple(reward.shape)}, got "
+                    f"{tuple(flag.shape)}; unsqueeze or expand it."
+                )
         with (
             torch.no_grad(),
             set_exploration_type(ExplorationType.RANDOM),
@@ -476,16 +487,11 @@ class TsallisLoss(SACLoss):
             if alive is not None:
                 value = value.new_zeros(alive.shape).masked_scatter_(alive, value)
             value = value.unsqueeze(-1)
-            for key, entry in (
-                (keys.reward, reward),
-                (keys.done, done),
-                (keys.terminated, terminated),
-            ):
-                if entry.shape != value.shape:
-                    raise ValueError(
-                        f"{key!r} must have the shape of the critic's value, {tuple(value.shape)}, "
-                        f"got {tuple(entry.shape)}; unsqueeze or expand it."
-                    )
+            if value.shape != reward.shape:
+                raise ValueError(
+                    f"{keys.state_action_value!r} must have the shape of {keys.reward!r}, "
+                    f"{tuple(reward.shape)}, got {tuple(value.shape)}."
+                )
             if not reward.is_floating_point():
                 next_tensordict.set(keys.reward, reward.to(value.dtype))
             next_tensordict.set(self.value_estimator.tensor_keys.value, value)
@@ -506,12 +512,12 @@ class TsallisLoss(SACLoss):
             ValueError: if the target in the input is not one number for each of the critic's.
         """
         keys = self.tensor_keys
+        for key in self.qvalue_network.in_keys:
+            get_entry(tensordict, key, "an input of qvalue_network")
         weights = self._maybe_get_priority_weight(tensordict)
         target = tensordict.get(keys.qvalue_target, None)
         if target is None:
             target = self.compute_target(tensordict)
-        for key in self.qvalue_network.in_keys:
-            get_entry(tensordict, key, "an input of qvalue_network")
         prediction = self._vmap_qnetworkN0(
             tensordict, self.qvalue_network_params, keys.state_action_value
         )

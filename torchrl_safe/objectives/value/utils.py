@@ -51,6 +51,6 @@ def repair_next(tensordict: TensorDictBase, keys: Sequence[NestedKey]) -> Tensor
             continue
         if key == "is_init":
             tensordict.set(next_key, value | following)
-        elif following.is_floating_point():
+        elif isinstance(following, Tensor) and following.is_floating_point():
             tensordict.set(next_key, torch.where(following.isnan(), value, following))
     return tensordict

@@ -47,7 +47,7 @@ def main(cfg: DictConfig) -> None:
         buffer.extend(batch.select(*REPLAYED))
         if run.frames < cfg.collector.init_frames:
             return {}
-        cost_loss.cost_limit.fill_(cost_limit_at(cfg, run.frames))
+        cost_loss.cost_limit = cost_limit_at(cfg, run.frames)
         with timeit("time/critics"):
             for _ in range(cfg.optim.critic_rounds):
                 data = replay(cfg.optim.critic_frames)

@@ -44,11 +44,12 @@ def make_closures(
     policy = make_policy(cfg, env)
     losses = make_losses(cfg, env, policy)
     states = TensorDict({"observation": torch.randn(NUM_STATES, 24)}, [NUM_STATES]).to(device)
-    level = torch.tensor(cfg.loss.cost_limit, device=device)
+    batch = env.rollout(20, policy)
+    losses[1].cost_limit = losses[1].on_policy_cvar(batch)
 
     def closure_of(curvature_frames: int | None = None) -> Callable[[], TensorDict]:
         torch.manual_seed(0)
-        return policy_closure(policy, *losses, states, level, curvature_frames)
+        return policy_closure(policy, *losses, states, batch, curvature_frames)
 
     return cfg, policy, states, closure_of
 

@@ -76,12 +76,11 @@ class ConstrainedStepper(TRPOStepper):
         with torch.no_grad():
             dist = self.policy.get_dist(batch)
             noise = dist.draw_noise()  # once: candidates are compared on equal draws
-            reference = self.cost_loss.cvar(batch, dist.rsample(noise=noise)).mean()
-            level = self.cost_loss.on_policy_cvar(batch)
+            measured = self.cost_loss.measure(batch, dist.rsample(noise=noise))
 
         def closure() -> TensorDict:
             action = self.policy.get_dist(batch).rsample(noise=noise)
-            value = self.cost_loss.constraint(batch, action, reference=reference, level=level)
+            value = self.cost_loss.constraint(batch, action, measured)
             return surrogate().set("constraint", value[None])
 
         return closure

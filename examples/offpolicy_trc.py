@@ -46,7 +46,7 @@ def run_offpolicy_trc(run: Run) -> None:
         buffer.extend(batch.select(*REPLAYED))
         if run.frames < cfg.collector.init_frames:
             return {}
-        cost_loss.cost_limit.fill_(cost_limit_at(cfg, run.frames))
+        cost_loss.cost_limit = cost_limit_at(cfg, run.frames)
         with timeit("time/critics"):
             for _ in range(cfg.optim.critic_rounds):
                 data = replay(cfg.optim.critic_frames)

@@ -44,32 +44,35 @@ def policy_closure(
     reward_loss: TsallisLoss,
     cost_loss: CVaRCostLoss,
     states: TensorDictBase,
-    level: torch.Tensor | None = None,
+    batch: TensorDictBase | None = None,
     curvature_frames: int | None = None,
     distance: Distance = MOMENT_MATCHED,
 ) -> Callable[[], TensorDict]:
     """Objective, constraint and statistics of (13) as a function of the policy's weights.
 
-    ``level`` is the CVaR that the policy of now is known to have; the critics say how a change
-    that is kept will move it. Without, the constraint is (8) as written, in the objective's scale.
-    The noise of the actions is drawn here, once: the line search then compares policies, not draws.
-    Curvature is that of the first ``curvature_frames`` states, all of them by default.
+    How high the cost of the policy of now stands is measured on ``batch``; the critics say how a
+    change that is kept will move it. Without, the constraint is (8) as written, of one action, as
+    the objective is. The noise of the actions is drawn here, once: the line search then compares
+    policies, not draws. Curvature is that of the first ``curvature_frames`` states, all of them by
+    default.
     """
     with torch.no_grad():
         dist = policy.get_dist(states)
         noise = dist.draw_noise()
-        reference = None
-        if level is not None:
-            reference = cost_loss.cvar(states, dist.rsample(noise=noise)).mean()
+        measured = None
+        if batch is not None:
+            measured = cost_loss.measure(batch, dist.rsample(noise=noise), states=states)
 
     def closure() -> TensorDict:
         dist = policy.get_dist(states)
         action, log_prob = dist.rsample_and_log_prob(noise=noise)
+        if measured is None:
+            constraint = cost_loss.cvar(states, action).mean() - cost_loss.cost_limit
+        else:
+            constraint = cost_loss.constraint(states, action, measured)
         out = {
             "objective": reward_loss.objective(states, action, log_prob).mean(),
-            "constraint": cost_loss.constraint(states, action, reference=reference, level=level)[
-                None
-            ],
+            "constraint": constraint[None],
             "statistics": distance.statistics(dist),
         }
         if curvature_frames is not None:
@@ -117,11 +120,10 @@ def run_safetac(run: Run) -> None:
         if run.frames < cfg.collector.init_frames:
             return {}
         limit = cost_limit_at(cfg, run.frames)
-        cost_loss.cost_limit.fill_(limit)
+        cost_loss.cost_limit = limit
         metrics = fit_critics()
         with timeit("time/policy"):
             visited = batch.select("observation").flatten()
-            level = cost_loss.on_policy_cvar(batch)
             if cfg["update"] == "trust_region":
                 order = torch.randperm(len(visited), device=visited.device)
                 states = visited[order[: cfg.optim.policy_frames]]
@@ -130,18 +132,21 @@ def run_safetac(run: Run) -> None:
                     reward_loss,
                     cost_loss,
                     states,
-                    level,
+                    batch,
                     cfg.optim.curvature_frames,
                     distance,
                 )
                 metrics |= policy_optim.step(closure).to_dict()
+                metrics["update/constraint"] += limit
             else:
+                level = cost_loss.on_policy_cvar(batch)
                 multiplier.update((level - limit)[None])
                 for states in minibatches(visited, cfg.lagrangian.minibatch_size):
                     closure = policy_closure(policy, reward_loss, cost_loss, states)
                     metrics |= ascend(descent, closure, multiplier())
                 metrics["update/skipped_steps"] += descent.count()
-        return {**metrics, "update/constraint": level.item(), "update/cost_limit": limit}
+                metrics["update/constraint"] = level.item()
+        return {**metrics, "update/cost_limit": limit}
 
     train(run, policy, update, eval_env)
 

@@ -15,8 +15,7 @@ from torchrl.envs import EnvBase
 from utils import make_critic
 
 from torchrl_safe import GMMTanhPolicy, TrustRegionSafeOptimizer
-from torchrl_safe.objectives import CVaRSurrogateLoss, ReturnSurrogateLoss
-from torchrl_safe.objectives.surrogate import CostMoments
+from torchrl_safe.objectives import CostMoments, CVaRSurrogateLoss, ReturnSurrogateLoss
 
 
 def make_surrogates(
@@ -75,7 +74,7 @@ def surrogate_closure(
     reward_loss: ReturnSurrogateLoss,
     cost_loss: CVaRSurrogateLoss,
     data: TensorDictBase,
-    cost_moments: CostMoments,
+    measured: CostMoments,
 ) -> Callable[[], TensorDict]:
     """Objective, constraint and policy moments as a function of the policy's weights."""
 
@@ -85,7 +84,7 @@ def surrogate_closure(
         return TensorDict(
             {
                 "objective": reward_loss.objective(data, log_prob),
-                "constraint": cost_loss.constraint(data, log_prob, cost_moments)[None],
+                "constraint": cost_loss.constraint(data, log_prob, measured)[None],
                 "statistics": moments(dist),
             }
         )
@@ -102,8 +101,8 @@ def policy_step(
     batch: TensorDictBase,
 ) -> dict[str, float]:
     """A trust-region step on ``data``; how high the cost stands is measured on ``batch``."""
-    cost_moments = cost_loss.on_policy_moments(batch)
-    closure = surrogate_closure(policy, reward_loss, cost_loss, data, cost_moments)
+    measured = cost_loss.measure(batch)
+    closure = surrogate_closure(policy, reward_loss, cost_loss, data, measured)
     report = policy_optim.step(closure)
     metrics = report.to_dict()
     limit = cost_loss.cost_limit.item()
@@ -111,5 +110,5 @@ def policy_step(
     return {
         **metrics,
         "update/cost_limit": limit,
-        "update/measured_cost_std": cost_moments.variance.sqrt().item(),
+        "update/measured_cost_std": measured.variance.sqrt().item(),
     }

@@ -36,7 +36,7 @@ def run_trc(run: Run) -> None:
 
     def update(batch: TensorDictBase) -> dict[str, float]:
         """Critics on the new batch, then a trust-region step on it; then it is thrown away."""
-        cost_loss.cost_limit.fill_(cost_limit_at(cfg, run.frames))
+        cost_loss.cost_limit = cost_limit_at(cfg, run.frames)
         with timeit("time/critics"):
             for _ in range(cfg.optim.critic_rounds):
                 data = with_advantages(batch, reward_loss, cost_loss)

@@ -74,7 +74,7 @@ def run_wcsac(run: Run) -> None:
         if run.frames < cfg.collector.init_frames:
             return {}
         limit = cost_limit_at(cfg, run.frames)
-        cost_loss.cost_limit.fill_(limit)
+        cost_loss.cost_limit = limit
         level = cost_loss.on_policy_cvar(batch)
         multiplier.update((level - limit)[None])
         with timeit("time/update"):
@@ -85,7 +85,7 @@ def run_wcsac(run: Run) -> None:
                 action, log_prob = policy.get_dist(minibatch).rsample_and_log_prob()
                 losses["loss_actor"] = -lagrangian(
                     reward_loss.objective(minibatch, action, log_prob).mean(),
-                    cost_loss.constraint(minibatch, action)[None],
+                    cost_loss.cvar(minibatch, action).mean()[None] - limit,  # of one action, too
                     multiplier(),
                 )
                 entropy = -q_logarithm(log_prob.detach(), cfg.loss.entropic_index)

@@ -77,14 +77,14 @@ class OnPolicy:
             data = [loss.compute_advantage(batch) for loss in self.losses]
             step(self.critic_optim, [loss(d) for loss, d in zip(self.losses, data, strict=True)])
         reward_data, *costs_data = (loss.compute_advantage(batch) for loss in self.losses)
-        moments = [loss.on_policy_moments(batch) for loss in self.cost_losses]
+        measured = [loss.measure(batch) for loss in self.cost_losses]
 
         def closure() -> TensorDict:
             dist = self.policy.get_dist(batch)
             log_prob = dist.log_prob(batch["action"])
             constraints = [
                 loss.constraint(d, log_prob, m)
-                for loss, d, m in zip(self.cost_losses, costs_data, moments, strict=True)
+                for loss, d, m in zip(self.cost_losses, costs_data, measured, strict=True)
             ]
             objective = self.reward_loss.objective(reward_data, log_prob)
             return outcome(dist, objective, constraints)
@@ -142,17 +142,16 @@ class OffPolicyBlocks:
             step(self.critic_optim, [TensorDict(loss_qvalue=loss_qvalue), *losses])
         states = batch.select("observation")
         noise = self.policy.get_dist(states).draw_noise()
-        levels = [loss.on_policy_cvar(batch) for loss in self.cost_losses]
         with torch.no_grad():
             action = self.policy.get_dist(states).rsample(noise=noise)
-            references = [loss.cvar(states, action).mean() for loss in self.cost_losses]
+        measured = [loss.measure(batch, action) for loss in self.cost_losses]
 
         def closure() -> TensorDict:
             dist = self.policy.get_dist(states)
             action, log_prob = dist.rsample_and_log_prob(noise=noise)
             constraints = [
-                loss.constraint(states, action, reference=reference, level=level)
-                for loss, reference, level in zip(self.cost_losses, references, levels, strict=True)
+                loss.constraint(states, action, m)
+                for loss, m in zip(self.cost_losses, measured, strict=True)
             ]
             # In the unit of the constraint, which matters to a multiplier.
             value = self.reward_loss.objective(states, action, log_prob).mean()

@@ -416,13 +416,15 @@ bad(
     "(2, 4, 1)",
     state=weights(tsallis),
 )
-each("CVaRCostLoss", make_cvar, "cost_limit", (-1.0, NAN, INF), "finite and at least 0")
+each("CVaRCostLoss", make_cvar, "cost_limit", (-1.0, NAN, INF), "finite number, at least 0")
 each("CVaRCostLoss", make_cvar, "risk_level", risk_levels, "in (0, 1]")
-each("CVaRCostLoss", make_cvar, "num_cost_nets", (0,), "at least 1")
+each("CVaRCostLoss", make_cvar, "num_cost_nets", (0, 1.5, True), "at least 1")
 each(
     "CVaRCostLoss", make_cvar, "variance_reward", ("none",), "one of ['second_moment', 'td_error']"
 )
-each("CVaRSurrogateLoss", make_surrogate, "cost_limit", (-1.0, NAN, INF), "finite and at least 0")
+each(
+    "CVaRSurrogateLoss", make_surrogate, "cost_limit", (-1.0, NAN, INF), "finite number, at least 0"
+)
 each("CVaRSurrogateLoss", make_surrogate, "risk_level", risk_levels, "in (0, 1]")
 for owner, make in {
     "TsallisLoss": make_tsallis,
@@ -444,16 +446,16 @@ for owner, loss in {
 bad(
     "CVaRCostLoss.make_value_estimator: value_type",
     lambda: cvar().make_value_estimator(ValueEstimators.GAE),
-    NotImplementedError,
+    ValueError,
     "value_type",
     "GAE",
-    "one of ['TD0', 'TDLambda']",
+    "one of 'td0', 'td1', 'tdlambda', 'retrace'",
     state=weights(cvar),
 )
 bad(
     "ReturnSurrogateLoss.make_value_estimator: value_type",
     lambda: return_surrogate().make_value_estimator(ValueEstimators.GAE),
-    NotImplementedError,
+    ValueError,
     "value_type",
     "GAE",
     "RetraceEstimator or None",
@@ -468,12 +470,22 @@ bad(
     state=weights(tsallis),
 )
 bad(
-    "CVaRCostLoss.constraint: level",
-    lambda: cvar().constraint(data(), zeros(2, 4, 2), level=torch.tensor(3.0)),
-    ValueError,
-    "level",
-    "3.",
-    "reference",
+    "CVaRCostLoss.constraint: measured",
+    lambda: cvar().constraint(data(), zeros(2, 4, 2), torch.tensor(3.0)),
+    TypeError,
+    "measured",
+    "Tensor",
+    "what measure(...) returned",
+    state=weights(cvar),
+)
+bad(
+    "CVaRSurrogateLoss.constraint: measured",
+    lambda: surrogate().constraint(data(), zeros(2, 4), torch.tensor(3.0)),
+    TypeError,
+    "measured",
+    "Tensor",
+    "what measure(...) returned",
+    state=weights(surrogate),
 )
 bad(
     "ReturnSurrogateLoss.objective: no advantage",
@@ -485,14 +497,22 @@ bad(
 )
 bad(
     "CVaRSurrogateLoss.constraint: no advantage",
-    lambda: surrogate().constraint(data(), zeros(2, 4), surrogate().on_policy_moments(data())),
+    lambda: surrogate().constraint(data(), zeros(2, 4), surrogate().measure(data())),
     KeyError,
     "'cost_advantage'",
     "is missing",
     "compute_advantage",
 )
+bad(
+    "TsallisLoss: no next observation",
+    lambda: tsallis()(data(("next", "observation"))),
+    KeyError,
+    '"observation"',
+    "not found",
+    "in TensorDict with keys",
+    state=weights(tsallis),
+)
 for owner, loss, key in (
-    ("TsallisLoss", tsallis, ("next", "observation")),
     ("CVaRCostLoss", cvar, ("next", "observation")),
     ("CVaRSurrogateLoss", surrogate, "observation"),
 ):
@@ -500,11 +520,24 @@ for owner, loss, key in (
         f"{owner}: no {key}",
         lambda loss=loss, key=key: loss()(data(key)),
         KeyError,
-        '"observation"',
-        "not found",
-        "in TensorDict with keys",
+        "observation",
+        "is not in the tensordict",
+        "which has",
         state=weights(loss),
     )
+for owner, loss in {"CVaRCostLoss": cvar, "CVaRSurrogateLoss": surrogate}.items():
+    for name, values, allowed in (
+        ("cost_limit", (-1.0, NAN, INF, "1"), "finite number, at least 0"),
+        ("risk_level", risk_levels, "in (0, 1]"),
+    ):
+        each(
+            f"{owner}, when it is set",
+            lambda loss=loss, **option: [setattr(loss(), *pair) for pair in option.items()],
+            name,
+            values,
+            allowed,
+            state=weights(loss),
+        )
 
 # Retrace.
 

@@ -64,7 +64,7 @@ class Update:
                 self.policy,
                 *self.losses,
                 batch.select("observation").flatten(),
-                self.losses[1].on_policy_cvar(batch),
+                batch,
                 distance=MATCHED_BOUND,
             )
         )

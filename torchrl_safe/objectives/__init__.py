@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
-from torchrl_safe.objectives.cvar import CVaRCostLoss
+from torchrl_safe.objectives.cvar import CVaRCostLoss, MeasuredCVaR
 from torchrl_safe.objectives.lagrangian import LagrangeMultiplier, PIDMultiplier, lagrangian
-from torchrl_safe.objectives.surrogate import CVaRSurrogateLoss, ReturnSurrogateLoss
+from torchrl_safe.objectives.surrogate import (
+    CostMoments,
+    CVaRSurrogateLoss,
+    ReturnSurrogateLoss,
+)
 from torchrl_safe.objectives.tsallis import TsallisLoss
 
 __all__ = [
     "CVaRCostLoss",
     "CVaRSurrogateLoss",
+    "CostMoments",
     "LagrangeMultiplier",
+    "MeasuredCVaR",
     "PIDMultiplier",
     "ReturnSurrogateLoss",
     "TsallisLoss",

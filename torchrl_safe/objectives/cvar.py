@@ -2,37 +2,51 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import torch
 from tensordict import TensorDict, TensorDictBase, TensorDictParams
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule, dispatch
-from tensordict.utils import NestedKey
-from torch import Tensor
+from tensordict.utils import NestedKey, unravel_key
+from torch import Tensor, nn
 from torch.distributions import Distribution
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.modules.distributions.utils import sample_and_log_prob
-from torchrl.objectives import LossModule, distance_loss
-from torchrl.objectives.utils import ValueEstimators, build_value_estimator
+from torchrl.objectives import distance_loss
+from torchrl.objectives.utils import ValueEstimators
 from torchrl.objectives.value import ValueEstimatorBase
 
-from torchrl_safe.objectives.functional import check_regression, check_risk_level, gaussian_cvar
-from torchrl_safe.objectives.utils import ensemble
+from torchrl_safe.objectives.common import CostLoss, spread
+from torchrl_safe.objectives.functional import check_regression, gaussian_cvar
+from torchrl_safe.objectives.utils import as_given, ensemble, make_estimator
 from torchrl_safe.objectives.value import (
     PolicyEvaluation,
     RetraceEstimator,
     retrace_variance_reward,
     squared_td_error,
 )
-from torchrl_safe.objectives.value.utils import behaviour_log_prob
+from torchrl_safe.objectives.value.utils import behaviour_log_prob, get_entry, repair_next
 
 VARIANCE_REWARDS = {"td_error": squared_td_error, "second_moment": retrace_variance_reward}
 
 
-class CVaRCostLoss(LossModule):
+class MeasuredCVaR(NamedTuple):
+    """Where the cost of a policy stands, from :meth:`CVaRCostLoss.measure`.
+
+    Attributes:
+        level (Tensor): mean CVaR of the policy, a scalar in units of the discounted cost sum.
+        reference (Tensor): the critics' CVaR at the policy's own actions, ``[*B]``.
+        horizon (Tensor): discounted number of steps for which a change of the policy is kept, a
+            scalar: ``1 / (1 - gamma)`` if nothing terminates.
+    """
+
+    level: Tensor
+    reference: Tensor
+    horizon: Tensor
+
+
+class CVaRCostLoss(CostLoss):
     r"""Safety critics and the constraint on the CVaR of the discounted cost, (6)-(8), (18).
 
     Two critics describe the discounted sum of costs that follows a state and an action by its
@@ -53,15 +67,17 @@ class CVaRCostLoss(LossModule):
 
     Args:
         actor_network (ProbabilisticTensorDictSequential): stochastic actor.
-        cost_network (TensorDictModule): writes ``"cost_value"``, ``[*B, 1]``.
-        std_network (TensorDictModule): writes ``"cost_std"``, ``[*B, 1]``, non-negative: end it
-            with a softplus.
+        cost_network (TensorDictModule or list of them): writes ``"cost_value"``, ``[*B, 1]``.
+        std_network (TensorDictModule or list of them): writes ``"cost_std"``, ``[*B, 1]``,
+            non-negative: end it with a softplus. The two may share layers.
 
     Keyword Args:
         cost_limit (float): limit on the discounted cost sum, at least 0.
         risk_level (float): share of worst outcomes that the CVaR averages, in (0, 1]; 1 is the
             plain expectation. Defaults to 0.125.
-        num_cost_nets (int): networks of each kind; predictions are averaged. Defaults to 1.
+        num_cost_nets (int): networks of each kind; predictions are averaged. One network is the
+            one that was given, those of a list keep their weights, and copies of one network have
+            weights drawn anew. Defaults to 1.
         loss_function (str): ``"l2"``, ``"smooth_l1"`` or ``"l1"``. Defaults to ``"l2"``.
         delay_cost (bool): use target networks for the targets. Defaults to ``False``.
         reduction (str): ``"mean"``, ``"sum"`` or ``"none"``. Defaults to ``"mean"``.
@@ -111,8 +127,10 @@ class CVaRCostLoss(LossModule):
         ... )
         >>> sorted(loss(data).keys())
         ['cost_std', 'cost_value', 'loss_cost_std', 'loss_cost_value']
-        >>> action = actor.get_dist(data).rsample()
-        >>> loss.constraint(data, action).backward()  # E[Gamma] - cost_limit
+        >>> noise = actor.get_dist(data).draw_noise()
+        >>> measured = loss.measure(data, actor.get_dist(data).rsample(noise=noise))
+        >>> action = actor.get_dist(data).rsample(noise=noise)  # of the policy to be improved
+        >>> loss.constraint(data, action, measured).backward()
     """
 
     @dataclass
@@ -152,7 +170,12 @@ class CVaRCostLoss(LossModule):
     tensor_keys: _AcceptedKeys
     default_value_estimator = RetraceEstimator
 
-    SUPPORTED_VALUE_ESTIMATORS = (ValueEstimators.TD0, ValueEstimators.TDLambda)
+    SUPPORTED_VALUE_ESTIMATORS = (
+        ValueEstimators.TD0,
+        ValueEstimators.TD1,
+        ValueEstimators.TDLambda,
+        "retrace",
+    )
 
     actor_network: ProbabilisticTensorDictSequential
     cost_network: TensorDictModule
@@ -167,8 +190,8 @@ class CVaRCostLoss(LossModule):
     def __init__(
         self,
         actor_network: ProbabilisticTensorDictSequential,
-        cost_network: TensorDictModule,
-        std_network: TensorDictModule,
+        cost_network: TensorDictModule | list[TensorDictModule],
+        std_network: TensorDictModule | list[TensorDictModule],
         *,
         cost_limit: float,
         risk_level: float = 0.125,
@@ -180,12 +203,7 @@ class CVaRCostLoss(LossModule):
         deactivate_vmap: bool = False,
         use_prioritized_weights: bool | Literal["auto"] = "auto",
     ) -> None:
-        check_risk_level(risk_level)
         check_regression(loss_function, reduction)
-        if not 0 <= cost_limit < float("inf"):
-            raise ValueError(f"cost_limit must be finite and at least 0, got {cost_limit}.")
-        if num_cost_nets < 1:
-            raise ValueError(f"num_cost_nets must be at least 1, got {num_cost_nets}.")
         if variance_reward not in VARIANCE_REWARDS:
             raise ValueError(
                 f"variance_reward must be one of {sorted(VARIANCE_REWARDS)}, "
@@ -197,17 +215,25 @@ class CVaRCostLoss(LossModule):
         self.use_prioritized_weights = use_prioritized_weights
         self.convert_to_functional(actor_network, "actor_network", create_target_params=False)
         self.delay_cost = delay_cost
-        for name, network in (("cost_network", cost_network), ("std_network", std_network)):
-            self.convert_to_functional(
+        for name, network, other in (
+            ("cost_network", cost_network, std_network),
+            ("std_network", std_network, cost_network),
+        ):
+            module, expand_dim = as_given(
                 network,
-                name,
                 num_cost_nets,
+                names=(name, "num_cost_nets"),
+                others=nn.ModuleList(other if isinstance(other, list) else [other]).parameters(),
+            )
+            self.convert_to_functional(
+                module,
+                name,
+                expand_dim,
                 create_target_params=delay_cost,
                 compare_against=list(actor_network.parameters()),
             )
-        self.risk_level = risk_level
+        self._register_limit(cost_limit, risk_level)
         self.variance_reward = variance_reward
-        self.register_coeff_buffer("cost_limit", float(cost_limit), device=self._default_device)
         self.loss_function = loss_function
         self.reduction = reduction
         self.deactivate_vmap = deactivate_vmap
@@ -222,7 +248,7 @@ class CVaRCostLoss(LossModule):
 
     def make_value_estimator(
         self,
-        value_type: ValueEstimators | type[ValueEstimatorBase] | None = None,
+        value_type: ValueEstimators | str | type[ValueEstimatorBase] | None = None,
         **hyperparams: Any,
     ) -> CVaRCostLoss:
         """Choose the estimator of both targets.
@@ -231,36 +257,49 @@ class CVaRCostLoss(LossModule):
         two estimators of one kind are made.
 
         Args:
-            value_type (ValueEstimators or class, optional): TD(0), TD(lambda) or an estimator
-                class. Defaults to :class:`~torchrl_safe.RetraceEstimator`.
+            value_type (ValueEstimators, str or class, optional): TD(0), TD(1), TD(lambda) or
+                Retrace, as a member, by name (``"td0"``) or as a class.
+                Defaults to :class:`~torchrl_safe.RetraceEstimator`.
             **hyperparams: of the estimator; ``gamma`` is the discount of the cost.
 
         Returns:
             The loss itself.
+
+        Raises:
+            ValueError: for another ``value_type``, an instance included, if ``gamma`` is outside
+                [0, 1), or for ``average_rewards`` and ``group_key``.
         """
-        value_type = self.default_value_estimator if value_type is None else value_type
+        if value_type is None or (isinstance(value_type, str) and value_type.lower() == "retrace"):
+            value_type = self.default_value_estimator
+        if isinstance(value_type, ValueEstimatorBase):
+            raise ValueError(
+                "value_type must be a name, a member of ValueEstimators or a class, got an "
+                f"instance of {type(value_type).__name__}: it has one discount, and the variance "
+                "needs the square of the mean's."
+            )
+        for name in ("average_rewards", "group_key"):
+            if hyperparams.get(name):
+                raise ValueError(
+                    f"{name} must be left out, got {hyperparams[name]!r}: standardised costs are "
+                    "not in the unit of cost_limit."
+                )
         gamma = hyperparams.pop("gamma", 0.99)
         if not 0 <= gamma < 1:
             raise ValueError(f"gamma must be in [0, 1), got {gamma}.")
-        if value_type is RetraceEstimator:
-            hyperparams.setdefault("lmbda", 0.97)
-        if isinstance(value_type, ValueEstimators):
-            if value_type not in self.SUPPORTED_VALUE_ESTIMATORS:
-                supported = [member.name for member in self.SUPPORTED_VALUE_ESTIMATORS]
-                raise NotImplementedError(
-                    f"value_type {value_type} is not supported; use one of {supported} or an "
-                    "estimator class."
-                )
-            build: Callable[..., ValueEstimatorBase] = partial(
-                build_value_estimator, self, value_type
+
+        def build(discount: float) -> tuple[ValueEstimatorBase, Any]:
+            if isinstance(value_type, type) and issubclass(value_type, RetraceEstimator):
+                # On values that this loss computes, in place of networks.
+                options = {"lmbda": 0.97, **hyperparams}
+                return value_type(gamma=discount, **options), value_type
+            supported = self.SUPPORTED_VALUE_ESTIMATORS
+            return make_estimator(
+                self, value_type, supported=supported, gamma=discount, **hyperparams
             )
-        else:
-            build = value_type
-        self._value_estimator, self._variance_estimator = (
-            build(gamma=discount, value_network=None, **hyperparams)
-            for discount in (gamma, gamma**2)
-        )
-        self.value_type = value_type
+
+        estimator, kind = build(gamma)
+        self._variance_estimator, _ = build(gamma**2)
+        self._value_estimator, self.value_type = estimator, kind
         self._forward_value_estimator_keys()
         return self
 
@@ -311,23 +350,22 @@ class CVaRCostLoss(LossModule):
             TensorDict of ``loss_cost_value``, ``loss_cost_std``, and the detached means
             ``cost_value`` and ``cost_std`` of the predictions.
         """
-        keys = self.tensor_keys
         weights = self._maybe_get_priority_weight(tensordict)
-        mean_target = tensordict.get(keys.cost_target, None)
-        std_target = tensordict.get(keys.std_target, None)
-        if mean_target is None or std_target is None:
-            mean_target, std_target = self.compute_target(tensordict)
         mean, std = self._predict(tensordict, self.cost_network_params, self.std_network_params)
+        mean_target, std_target = self._targets(tensordict, mean[0])
         out = {}
         for name, prediction, target in (("value", mean, mean_target), ("std", std, std_target)):
-            loss = distance_loss(
-                prediction, target.squeeze(-1).expand_as(prediction), self.loss_function
-            ).sum(0)
+            loss = distance_loss(prediction, target.expand_as(prediction), self.loss_function).sum(
+                0
+            )
             out[f"loss_cost_{name}"] = self._reduce_loss(
                 loss, tensordict=tensordict, weights=weights
             )
-            each = self.reduction == "none"
-            out[f"cost_{name}"] = prediction.detach().mean(0 if each else None)
+            out[f"cost_{name}"] = self._reduce_loss(
+                prediction.detach().mean(0),
+                tensordict=tensordict,
+                reduction="none" if self.reduction == "none" else "mean",
+            )
         td_out = TensorDict(out, tensordict.batch_size if self.reduction == "none" else [])
         self._clear_weakrefs(
             tensordict,
@@ -363,50 +401,45 @@ class CVaRCostLoss(LossModule):
         estimator_keys = estimator.tensor_keys
         # Estimators of state values read no value of the stored action.
         action_value_key = getattr(estimator_keys, "state_action_value", "state_action_value")
-        next_tensordict = tensordict.get("next")
         critics = (self.target_cost_network_params, self.target_std_network_params)
+        cost, done, terminated, mask = self._read_steps(tensordict, keys.cost, estimator)
+        discount, steps = self._discount(tensordict, cost, estimator)
         with torch.no_grad(), set_exploration_type(ExplorationType.RANDOM):
-            if policy is None:
-                next_action, _ = sample_and_log_prob(self._target_dist(next_tensordict))
-            else:
-                next_action = policy.next_action
-            data = tensordict.select(
-                keys.log_prob,
-                *(_next(key) for key in (keys.cost, keys.done, keys.terminated)),
-                strict=False,
+            values = (
+                *(x.mean(0).unsqueeze(-1) for x in self._predict(tensordict, *critics)),
+                *self._predict_next(tensordict, None if policy is None else policy.next_action),
             )
-            mean, std = (
-                prediction.mean(0).unsqueeze(-1)
-                for prediction in self._predict(tensordict, *critics)
-            )
-            next_mean, next_std = (
-                prediction.mean(0).unsqueeze(-1)
-                for prediction in self._predict(
-                    self._inputs(next_tensordict, next_action), *critics
-                )
-            )
+            mean, std, next_mean, next_std = (x.masked_fill(~mask, 0) for x in values)
+            data = tensordict.select()
+            data.set(_next(keys.done), done)
+            data.set(_next(keys.terminated), terminated)
+            if steps is not None:
+                data.set(estimator_keys.steps_to_next_obs, steps)
             options = {}
             if isinstance(estimator, RetraceEstimator):
-                if policy is None:
-                    log_prob = self._target_dist(tensordict).log_prob(tensordict.get(keys.action))
-                else:
-                    log_prob = policy.log_prob
-                options["policy_log_prob"] = log_prob
                 log_mu = behaviour_log_prob(tensordict, keys.log_prob, self.actor_network)
-                data.set(keys.log_prob, log_mu)
-            cost = data.get(_next(keys.cost))
-            terminated = data.get(_next(keys.terminated), data.get(_next(keys.done)))
+                if policy is None:
+                    action = get_entry(tensordict, keys.action, "the stored action")
+                    log_pi = self._target_dist(tensordict).log_prob(action)
+                else:
+                    log_pi = policy.log_prob
+                data.set(keys.log_prob, spread(_joint(log_mu), cost[..., :1]))
+                options["policy_log_prob"] = spread(_joint(log_pi), cost[..., :1])
 
-            data.set(action_value_key, mean)
-            data.set(_next(estimator_keys.value), next_mean)
-            mean_target = estimator.value_estimate(data, **options)
+            def estimate(
+                estimator: ValueEstimatorBase, reward: Tensor, value: Tensor, next_value: Tensor
+            ) -> Tensor:
+                data.set(_next(keys.cost), reward)
+                data.set(action_value_key, value)
+                data.set(_next(estimator_keys.value), next_value)
+                return estimator.value_estimate(data, **options)
 
+            mean_target = estimate(estimator, cost, mean, next_mean)
             variance_reward = VARIANCE_REWARDS[self.variance_reward]
-            reward = variance_reward(estimator.gamma, cost, mean, next_mean, terminated)
-            data.set(_next(keys.cost), reward)
-            data.set(action_value_key, std.square())
-            data.set(_next(estimator_keys.value), next_std.square())
-            variance_target = self._variance_estimator.value_estimate(data, **options)
+            reward = variance_reward(discount, cost, mean, next_mean, terminated)
+            variance_target = estimate(
+                self._variance_estimator, reward, std.square(), next_std.square()
+            )
         # Trace corrections can make a sampled target of a variance negative.
         return mean_target, variance_target.clamp(min=0).sqrt()
 
@@ -443,67 +476,148 @@ class CVaRCostLoss(LossModule):
         """
         return gaussian_cvar(*self.predict(tensordict, action), self.risk_level)
 
+    @torch.no_grad()
     def on_policy_cvar(self, tensordict: TensorDictBase) -> Tensor:
         r"""Mean CVaR of the policy that took the given steps, from the costs it really met.
 
-        Over the states that a policy visits, the mean of its ``Q_C`` is its mean cost per step
-        over ``1 - gamma``. Measured like this, the level follows the policy at once, where the
-        critic has to learn it; the standard deviation is the critic's.
+        The mean over the visited states of ``Q_C`` is measured,
+        :func:`~torchrl_safe.objectives.value.visited_value_estimate`: where nothing terminates, it
+        is the mean cost per step over ``1 - gamma``. Measured like this, the level follows the
+        policy at once, where the critic has to learn it; the standard deviation is the critic's.
 
         Args:
-            tensordict (TensorDictBase): steps of the current policy, ``[*B]``.
+            tensordict (TensorDictBase): steps of the current policy in the order of time,
+                ``[*B, T]``, without n-step transitions.
 
         Returns:
             The mean CVaR, a scalar without gradient, in units of the discounted cost sum.
+
+        Raises:
+            KeyError: if an entry is missing.
+            ValueError: if steps are sums of several.
         """
         keys = self.tensor_keys
-        with torch.no_grad():
-            std = self._vmap_std_network(tensordict, self.std_network_params, keys.cost_std)
-            mean = tensordict.get(_next(keys.cost)).mean() / (1 - self.value_estimator.gamma)
-            return gaussian_cvar(mean, std.mean(), self.risk_level)
+        mean = self._measured_mean(
+            tensordict, keys.cost, self.value_estimator, lambda td: self._predict_next(td, None)[0]
+        )
+        std = self._vmap_std_network(tensordict, self.std_network_params, keys.cost_std)
+        std = self._mean(std.squeeze(-1).mean(0), tensordict)
+        return gaussian_cvar(mean.to(std), std, self.risk_level)
+
+    @torch.no_grad()
+    def measure(
+        self, tensordict: TensorDictBase, action: Tensor, *, states: TensorDictBase | None = None
+    ) -> MeasuredCVaR:
+        """Where the cost of the current policy stands, for :meth:`constraint`.
+
+        Args:
+            tensordict (TensorDictBase): steps of the current policy, see :meth:`on_policy_cvar`.
+            action (Tensor): reparameterised actions of the current policy, ``[*B, D]``, from the
+                noise that actions will be drawn with in :meth:`constraint`.
+
+        Keyword Args:
+            states (TensorDictBase, optional): what :meth:`constraint` will be called with,
+                ``[*B]``, if that is not the tensordict itself.
+
+        Returns:
+            MeasuredCVaR: without gradient.
+
+        Raises:
+            KeyError: if an entry is missing.
+            ValueError: if steps are sums of several.
+        """
+        return MeasuredCVaR(
+            self.on_policy_cvar(tensordict),
+            self.cvar(tensordict if states is None else states, action),
+            self._measured_horizon(tensordict, self.tensor_keys.cost, self.value_estimator),
+        )
 
     def constraint(
-        self,
-        tensordict: TensorDictBase,
-        action: Tensor,
-        *,
-        reference: Tensor | None = None,
-        level: Tensor | None = None,
+        self, tensordict: TensorDictBase, action: Tensor, measured: MeasuredCVaR
     ) -> Tensor:
-        r"""The constraint (8), ``E[Gamma] - cost_limit``, feasible at or below 0.
-
-        (8) follows the policy for one action and the critics' policy from then on. A policy
-        keeps its change: by the policy gradient theorem, the effect on the discounted sum of
-        following it at every step is ``1 / (1 - gamma)`` times that of one action. Given the
-        ``reference``, the mean of :meth:`cvar` at the policy that the critics describe, the
-        constraint is in the units of what the change really does:
+        r"""The constraint, feasible at or below 0, in the unit of ``cost_limit``.
 
         .. math::
 
-            \text{level} + \frac{E[\Gamma] - \text{reference}}{1 - \gamma} - d
+            \text{level} + \text{horizon} \cdot E[\Gamma - \text{reference}] - d
+
+        (8) as written, ``cvar(tensordict, action).mean() - cost_limit``, follows the policy for one
+        action and the critics' policy from then on. A policy keeps its change: by the policy
+        gradient theorem, the effect on the discounted sum of following it at every step is
+        ``horizon`` times that of one action, ``1 / (1 - gamma)`` times if nothing terminates. At
+        the policy that was measured the constraint is how far its level is from the limit.
+
+        In a Lagrangian the objective must follow the policy for as long: put
+        :meth:`TsallisLoss.objective <torchrl_safe.TsallisLoss.objective>`, which is of one action,
+        beside :meth:`cvar`, or its mean over ``1 - gamma`` beside this. A trust region does not
+        mind how the objective is scaled.
 
         Args:
             tensordict (TensorDictBase): holds the critics' inputs but the action, ``[*B]``.
             action (Tensor): reparameterised actions of the policy, ``[*B, D]``.
-
-        Keyword Args:
-            reference (Tensor, optional): scalar. Without it, the constraint is (8) as written.
-            level (Tensor, optional): CVaR of the policy before its change, a scalar, such as
-                :meth:`on_policy_cvar`. Defaults to ``reference``.
+            measured (MeasuredCVaR): what :meth:`measure` returned for the policy before its change,
+                with the same states and noise.
 
         Returns:
             The constraint, a scalar, in units of the discounted cost sum.
 
         Raises:
-            ValueError: if there is a ``level`` and no ``reference``.
+            TypeError: if ``measured`` is something else.
+            ValueError: if it was measured on another number of states.
         """
-        value = self.cvar(tensordict, action).mean()
-        if reference is not None:
-            change = (value - reference) / (1 - self.value_estimator.gamma)
-            value = (reference if level is None else level) + change
-        elif level is not None:
-            raise ValueError(f"level={level} needs the reference that it takes the place of.")
-        return value - self.cost_limit
+        if not isinstance(measured, MeasuredCVaR):
+            raise TypeError(
+                f"measured must be what measure(...) returned, got {type(measured).__name__}."
+            )
+        value = self.cvar(tensordict, action)
+        if value.shape != measured.reference.shape:
+            raise ValueError(
+                f"measured must be of the states in the tensordict, {tuple(value.shape)}, got a "
+                f"reference of shape {tuple(measured.reference.shape)}: hand them to measure, too."
+            )
+        change = self._mean(value - measured.reference, tensordict)
+        return measured.level + measured.horizon * change - self.cost_limit
+
+    def _targets(self, tensordict: TensorDictBase, prediction: Tensor) -> tuple[Tensor, Tensor]:
+        """Targets of mean and deviation, ``[*B]``: those in the data, or computed."""
+        keys = self.tensor_keys.cost_target, self.tensor_keys.std_target
+        given = {key: tensordict.get(key, None) for key in keys}
+        missing = [key for key, target in given.items() if target is None]
+        if len(missing) == 2:
+            mean, std = self.compute_target(tensordict)
+            return mean.squeeze(-1), std.squeeze(-1)
+        if missing:
+            (found,) = given.keys() - missing
+            raise KeyError(
+                f"{missing[0]!r} is missing beside {found!r}: write both, as compute_target "
+                "returns them, or neither. An entry of that name that is not this loss's needs "
+                "another, set_keys(cost_target=...)."
+            )
+        shape = (*prediction.shape, 1)
+        for key, target in given.items():
+            if target.shape != shape:
+                raise ValueError(
+                    f"{key!r} must have shape {shape}, that of the critics' output, got "
+                    f"{tuple(target.shape)}: compute_target returns it, or set_keys names another "
+                    "entry."
+                )
+        return given[keys[0]].squeeze(-1), given[keys[1]].squeeze(-1)
+
+    def _predict_next(
+        self, tensordict: TensorDictBase, action: Tensor | None
+    ) -> tuple[Tensor, Tensor]:
+        """Target critics at the next state and an action of the policy there, ``[*B, 1]`` each."""
+        in_keys = [*self.cost_network.in_keys, *self.std_network.in_keys]
+        for key in in_keys:
+            if key != self.tensor_keys.action:
+                get_entry(tensordict, _next(key), "an input of the critics at the next state")
+        in_keys += self.actor_network.in_keys
+        following = repair_next(tensordict, in_keys).get("next")
+        if action is None:
+            action, _ = sample_and_log_prob(self._target_dist(following))
+        critics = (self.target_cost_network_params, self.target_std_network_params)
+        mean, std = self._predict(self._inputs(following, action), *critics)
+        return mean.mean(0).unsqueeze(-1), std.mean(0).unsqueeze(-1)
 
     def _target_dist(self, tensordict: TensorDictBase) -> Distribution:
         with self.target_actor_network_params.to_module(
@@ -528,4 +642,11 @@ class CVaRCostLoss(LossModule):
 
 
 def _next(key: NestedKey) -> NestedKey:
-    return ("next", *key) if isinstance(key, tuple) else ("next", key)
+    return unravel_key(("next", key))
+
+
+def _joint(log_prob: Tensor | TensorDictBase) -> Tensor:
+    """Log-density of the whole action, also of one with several leaves."""
+    if isinstance(log_prob, TensorDictBase):
+        return torch.stack([*log_prob.values(True, True)]).sum(0)
+    return log_prob

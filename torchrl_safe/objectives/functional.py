@@ -176,7 +176,13 @@ def discounted_cost_limit(cost_rate: float, gamma: float) -> float:
 
 
 def surrogate_change(
-    log_prob: Tensor, log_pi: Tensor, log_mu: Tensor, advantage: Tensor, gamma: float
+    log_prob: Tensor,
+    log_pi: Tensor,
+    log_mu: Tensor,
+    advantage: Tensor,
+    gamma: float,
+    *,
+    mask: Tensor | None = None,
 ) -> Tensor:
     r"""Change of a discounted sum from one policy to another, to first order.
 
@@ -193,12 +199,19 @@ def surrogate_change(
     :class:`~torchrl_safe.objectives.CVaRSurrogateLoss`. Advantages are centred, which in
     expectation changes nothing.
 
+    Ratios are multiplied as logarithms. Where actions are so improbable under ``pi`` that every
+    ratio to the sampler underflows, the data say nothing about ``pi``: the change and its gradient
+    are 0.
+
     Args:
         log_prob (Tensor): log-density of the stored action under ``pi'``, ``[*B]``.
         log_pi (Tensor): under ``pi``, ``[*B]``.
         log_mu (Tensor): under the policy that took it, ``[*B]``.
         advantage (Tensor): of ``pi``, ``[*B]``.
         gamma (float): discount of ``J``, in [0, 1).
+
+    Keyword Args:
+        mask (Tensor, optional): false for steps to leave out, ``[*B]`` boolean.
 
     Returns:
         The change, a scalar.
@@ -222,9 +235,23 @@ def surrogate_change(
         )
     if not 0 <= gamma < 1:
         raise ValueError(f"gamma must be in [0, 1), got {gamma}.")
-    weight = (log_pi - log_mu).clamp(max=0).exp()
-    centred = advantage - (weight * advantage).mean() / weight.mean()
-    return (torch.expm1(log_prob - log_pi) * weight * centred).mean() / (1 - gamma)
+    if mask is None:
+        mask = torch.ones_like(log_prob, dtype=torch.bool)
+    elif mask.shape != log_prob.shape:
+        raise ValueError(
+            f"mask must have the shape of log_prob, {tuple(log_prob.shape)}, got "
+            f"{tuple(mask.shape)}."
+        )
+    # Finite, so that a softmax over weights that are all zero is an average like any other.
+    lowest = torch.finfo(log_pi.dtype).min
+    log_weight = (log_pi - log_mu).clamp(min=lowest, max=0).masked_fill(~mask, lowest)
+    advantage = advantage.masked_fill(~mask, 0)
+    baseline = (log_weight.flatten().softmax(0) * advantage.flatten()).sum()
+    # (ratio - 1) weight, without a factor that overflows where the product is moderate.
+    log_ratio = (log_prob - log_pi).masked_fill(~mask, 0)
+    rise, fall = (torch.where(x, log_ratio, 0) for x in (log_ratio > 0, ~(log_ratio > 0)))
+    moved = log_weight.exp() * fall.expm1() - (log_weight + rise).exp() * (-rise).expm1()
+    return (moved * (advantage - baseline)).sum() / mask.sum().clamp(min=1) / (1 - gamma)
 
 
 def matched_bound_kl(
@@ -426,9 +453,15 @@ def check_entropic_index(entropic_index: float) -> None:
     check_number("entropic_index", entropic_index, positive=True)
 
 
+def check_cost_limit(cost_limit: float) -> None:
+    """Raise a ``ValueError`` unless ``cost_limit`` is a finite number of at least 0."""
+    check_number("cost_limit", cost_limit, least=0)
+
+
 def check_risk_level(risk_level: float) -> None:
     """Raise a ``ValueError`` unless ``risk_level`` is in (0, 1]."""
-    if not (isinstance(risk_level, Real) and 0 < risk_level <= 1):
+    is_number = isinstance(risk_level, Real) and not isinstance(risk_level, bool)
+    if not (is_number and 0 < risk_level <= 1):
         raise ValueError(f"risk_level must be in (0, 1], got {risk_level!r}.")
 
 

@@ -11,31 +11,38 @@ from tensordict import TensorDict, TensorDictBase, TensorDictParams
 from tensordict.nn import TensorDictModule, dispatch
 from tensordict.utils import NestedKey
 from torch import Tensor
-from torchrl.objectives import LossModule, distance_loss
+from torchrl.objectives import distance_loss
+from torchrl.objectives.utils import ValueEstimators
 from torchrl.objectives.value import ValueEstimatorBase
 
-from torchrl_safe.objectives.functional import (
-    check_regression,
-    check_risk_level,
-    gaussian_cvar,
-    surrogate_change,
-)
+from torchrl_safe.objectives.common import CostLoss, Steps, TrajectoryLoss, spread
+from torchrl_safe.objectives.functional import check_regression, gaussian_cvar, surrogate_change
 from torchrl_safe.objectives.value import (
     RetraceEstimator,
     retrace_variance_reward,
     squared_td_error,
 )
-from torchrl_safe.objectives.value.utils import get_entry
+from torchrl_safe.objectives.value.utils import get_entry, repair_next
 
 
 class CostMoments(NamedTuple):
-    """Mean and variance of the discounted cost sum that a policy meets, scalars."""
+    """Where the cost of a policy stands, from :meth:`CVaRSurrogateLoss.measure`; scalars.
+
+    Attributes:
+        mean (Tensor): of the discounted cost sum that the policy meets.
+        variance (Tensor): of the same.
+        horizon (Tensor): discounted number of steps for which a change of the policy is kept,
+            ``1 / (1 - gamma)`` if nothing terminates.
+        square_horizon (Tensor): the same at discount ``gamma ** 2``, that of the variance.
+    """
 
     mean: Tensor
     variance: Tensor
+    horizon: Tensor
+    square_horizon: Tensor
 
 
-class _SurrogateLoss(LossModule):
+class _SurrogateLoss(TrajectoryLoss):
     """What both surrogates share: critics of states, Retrace on them, ratios."""
 
     default_value_estimator = RetraceEstimator
@@ -43,7 +50,7 @@ class _SurrogateLoss(LossModule):
 
     def make_value_estimator(
         self,
-        value_type: type[ValueEstimatorBase] | None = None,
+        value_type: ValueEstimators | str | type[ValueEstimatorBase] | None = None,
         *,
         gamma: float = 0.99,
         lmbda: float = 0.97,
@@ -54,7 +61,8 @@ class _SurrogateLoss(LossModule):
         that is generalised advantage estimation (https://arxiv.org/abs/1506.02438).
 
         Args:
-            value_type (class, optional): :class:`~torchrl_safe.RetraceEstimator`, the default.
+            value_type (str or class, optional): ``"retrace"`` or
+                :class:`~torchrl_safe.RetraceEstimator`, the default.
 
         Keyword Args:
             gamma (float): discount in [0, 1). Defaults to 0.99.
@@ -64,12 +72,11 @@ class _SurrogateLoss(LossModule):
             The loss itself.
 
         Raises:
-            NotImplementedError: for another estimator.
-            ValueError: if a coefficient is out of its range.
+            ValueError: for another estimator, or if a coefficient is out of its range.
         """
-        if value_type not in (None, RetraceEstimator):
-            raise NotImplementedError(
-                f"value_type must be RetraceEstimator or None, got {value_type}."
+        if value_type not in (None, RetraceEstimator, "retrace"):
+            raise ValueError(
+                f"value_type must be 'retrace', RetraceEstimator or None, got {value_type!r}."
             )
         if not 0 <= gamma < 1:
             raise ValueError(f"gamma must be in [0, 1), got {gamma}.")
@@ -81,13 +88,33 @@ class _SurrogateLoss(LossModule):
         self.gamma = gamma
 
     def _forward_value_estimator_keys(self, **kwargs: Any) -> None:
-        pass  # Data are handed to the estimators under their own keys.
+        # Data are handed to the estimators under their own keys.
+        self.in_keys = self._regression_keys()
 
     def _value(self, name: str, key: NestedKey, tensordict: TensorDictBase) -> Tensor:
         """A critic's prediction, [*B, 1]."""
         network: TensorDictModule = getattr(self, name)
+        for in_key in network.in_keys:
+            get_entry(tensordict, in_key, f"an input of {name}")
         with getattr(self, f"{name}_params").to_module(network):
-            return network(tensordict.select(*network.in_keys)).get(key)
+            out = network(tensordict.select(*network.in_keys))
+        return get_entry(out, key, f"the output of {name}")
+
+    def _next_value(self, name: str, key: NestedKey, tensordict: TensorDictBase) -> Tensor:
+        """A critic's prediction of the next state, [*B, 1]."""
+        in_keys = getattr(self, name).in_keys
+        for in_key in in_keys:
+            get_entry(tensordict, ("next", in_key), f"an input of {name} at the next state")
+        return self._value(name, key, repair_next(tensordict, in_keys).get("next"))
+
+    def _values(
+        self, name: str, key: NestedKey, tensordict: TensorDictBase, mask: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """A critic's predictions of both states of steps, [*B, T, 1]; 0 for padding."""
+        value, next_value = (
+            predict(name, key, tensordict) for predict in (self._value, self._next_value)
+        )
+        return value.masked_fill(~mask, 0), next_value.masked_fill(~mask, 0)
 
     def _scored(self, tensordict: TensorDictBase, policy_log_prob: Tensor | None) -> TensorDictBase:
         """A shallow copy in which the policy that advantages belong to is the given one."""
@@ -102,40 +129,46 @@ class _SurrogateLoss(LossModule):
     def _log_probs(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor]:
         """Log-densities of the stored action under the policy and under its sampler, [*B]."""
         keys = self.tensor_keys
-        return self._computed(tensordict, keys.policy_log_prob), tensordict.get(keys.log_prob)
+        log_mu = get_entry(
+            tensordict,
+            keys.log_prob,
+            "the log-density of the action under the policy that took it, [*B, T]",
+        )
+        return self._computed(tensordict, keys.policy_log_prob), log_mu
 
     def _advantage(
         self,
         estimator: ValueEstimatorBase,
         tensordict: TensorDictBase,
-        reward: Tensor,
+        steps: Steps,
         value: Tensor,
         next_value: Tensor,
     ) -> Tensor:
-        log_pi, log_mu = self._log_probs(tensordict)
-        data = TensorDict(
+        log_pi, log_mu = (
+            spread(log_prob, steps.reward[..., :1]) for log_prob in self._log_probs(tensordict)
+        )
+        data = tensordict.select()  # keeps the name of time
+        data.update(
             {
                 "action_log_prob": log_mu,
                 "state_action_value": value,
                 "next": {
-                    "reward": reward,
+                    "reward": steps.reward,
                     "state_value": next_value,
-                    "done": tensordict.get(("next", self.tensor_keys.done)),
-                    "terminated": self._terminated(tensordict),
+                    "done": steps.done,
+                    "terminated": steps.terminated,
                 },
-            },
-            tensordict.batch_size,
+            }
         )
+        _, num_steps = self._discount(tensordict, steps.reward, estimator)
+        if num_steps is not None:
+            data.set(estimator.tensor_keys.steps_to_next_obs, num_steps)
         return estimator.value_estimate(data, policy_log_prob=log_pi) - value
 
-    def _terminated(self, tensordict: TensorDictBase) -> Tensor:
-        done = tensordict.get(("next", self.tensor_keys.done))
-        return tensordict.get(("next", self.tensor_keys.terminated), done)
-
-    def _weight(self, tensordict: TensorDictBase) -> Tensor:
-        """``min(1, pi / mu)``, the share of a correction that a critic of states takes, [*B, 1]."""
+    def _weight(self, tensordict: TensorDictBase, like: Tensor) -> Tensor:
+        """``min(1, pi / mu)``, the share of a correction that a critic of states takes."""
         log_pi, log_mu = self._log_probs(tensordict)
-        return (log_pi - log_mu).clamp(max=0).exp().unsqueeze(-1)
+        return spread((log_pi - log_mu).clamp(max=0).exp(), like)
 
     def _computed(self, tensordict: TensorDictBase, key: NestedKey) -> Tensor:
         value = tensordict.get(key, None)
@@ -150,9 +183,17 @@ class _SurrogateLoss(LossModule):
         self, tensordict: TensorDictBase, log_prob: Tensor, advantage: Tensor, gamma: float
     ) -> Tensor:
         log_pi, log_mu = self._log_probs(tensordict)
-        return surrogate_change(log_prob, log_pi, log_mu, advantage.squeeze(-1), gamma)
+        mask = self._mask(log_prob, tensordict)
+        return surrogate_change(log_prob, log_pi, log_mu, advantage.squeeze(-1), gamma, mask=mask)
 
-    def _regression(self, prediction: Tensor, target: Tensor, tensordict: TensorDictBase) -> Tensor:
+    def _regression(self, prediction: Tensor, key: NestedKey, tensordict: TensorDictBase) -> Tensor:
+        target = self._computed(tensordict, key)
+        if target.shape != prediction.shape:
+            raise ValueError(
+                f"{key!r} must have shape {tuple(prediction.shape)}, that of the critic's output, "
+                f"got {tuple(target.shape)}: compute_advantage writes it, or set_keys names "
+                "another entry."
+            )
         loss = distance_loss(prediction, target, self.loss_function).squeeze(-1)
         return self._reduce_loss(loss, tensordict=tensordict, weights=None)
 
@@ -251,9 +292,12 @@ class ReturnSurrogateLoss(_SurrogateLoss):
         self.convert_to_functional(value_network, "value_network", create_target_params=False)
         self.loss_function = loss_function
         self.reduction = reduction
-        self.in_keys = [*value_network.in_keys, self.tensor_keys.value_target]
+        self.in_keys = self._regression_keys()
         self.out_keys = ["loss_value"]
         self.make_value_estimator()
+
+    def _regression_keys(self) -> list[NestedKey]:
+        return [*self.value_network.in_keys, self.tensor_keys.value_target]
 
     @torch.no_grad()
     def compute_advantage(
@@ -274,14 +318,11 @@ class ReturnSurrogateLoss(_SurrogateLoss):
         """
         keys = self.tensor_keys
         out = self._scored(tensordict, policy_log_prob)
-        value, next_value = (
-            self._value("value_network", keys.value, states)
-            for states in (tensordict, tensordict.get("next"))
-        )
-        reward = tensordict.get(("next", keys.reward))
-        advantage = self._advantage(self._value_estimator, out, reward, value, next_value)
+        steps = self._read_steps(tensordict, keys.reward, self._value_estimator)
+        value, next_value = self._values("value_network", keys.value, tensordict, steps.mask)
+        advantage = self._advantage(self._value_estimator, out, steps, value, next_value)
         out.set(keys.advantage, advantage)
-        out.set(keys.value_target, value + self._weight(out) * advantage)
+        out.set(keys.value_target, value + self._weight(out, value) * advantage)
         return out
 
     @dispatch
@@ -296,7 +337,7 @@ class ReturnSurrogateLoss(_SurrogateLoss):
         """
         keys = self.tensor_keys
         value = self._value("value_network", keys.value, tensordict)
-        loss = self._regression(value, tensordict.get(keys.value_target), tensordict)
+        loss = self._regression(value, keys.value_target, tensordict)
         return TensorDict({"loss_value": loss}, loss.shape)
 
     def objective(self, tensordict: TensorDictBase, log_prob: Tensor) -> Tensor:
@@ -308,7 +349,8 @@ class ReturnSurrogateLoss(_SurrogateLoss):
             log_prob (Tensor): log-density of the stored actions under the new policy, ``[*B]``.
 
         Returns:
-            The change, a scalar, in units of the discounted return.
+            The change, a scalar, in units of the discounted return, of a policy that is followed
+            without end: where episodes terminate it is larger than it will be.
 
         Raises:
             KeyError: if there is no advantage in the data.
@@ -317,7 +359,7 @@ class ReturnSurrogateLoss(_SurrogateLoss):
         return self._change(tensordict, log_prob, advantage, self.gamma)
 
 
-class CVaRSurrogateLoss(_SurrogateLoss):
+class CVaRSurrogateLoss(CostLoss, _SurrogateLoss):
     r"""Surrogate of the CVaR of the discounted cost, and the critics behind it.
 
     The constraint of TRC (Kim and Oh, "TRC: Trust Region Conditional Value at Risk for Safe
@@ -405,9 +447,9 @@ class CVaRSurrogateLoss(_SurrogateLoss):
         >>> data = loss.compute_advantage(data)
         >>> sorted(loss(data).keys())
         ['loss_cost_value', 'loss_cost_variance']
-        >>> moments = loss.on_policy_moments(data)
+        >>> measured = loss.measure(data)
         >>> log_prob = torch.zeros(4, 10, requires_grad=True)  # of the policy to be improved
-        >>> loss.constraint(data, log_prob, moments).backward()  # Gamma - cost_limit
+        >>> loss.constraint(data, log_prob, measured).backward()  # Gamma - cost_limit
     """
 
     @dataclass
@@ -464,28 +506,27 @@ class CVaRSurrogateLoss(_SurrogateLoss):
         loss_function: str = "l2",
         reduction: Literal["mean", "sum", "none"] = "mean",
     ) -> None:
-        check_risk_level(risk_level)
         check_regression(loss_function, reduction)
-        if not 0 <= cost_limit < float("inf"):
-            raise ValueError(f"cost_limit must be finite and at least 0, got {cost_limit}.")
         super().__init__()
         for name, network in (
             ("cost_network", cost_network),
             ("variance_network", variance_network),
         ):
             self.convert_to_functional(network, name, create_target_params=False)
-        self.register_coeff_buffer("cost_limit", float(cost_limit), device=self._default_device)
-        self.risk_level = risk_level
+        self._register_limit(cost_limit, risk_level)
         self.loss_function = loss_function
         self.reduction = reduction
-        keys = self.tensor_keys
-        self.in_keys = [
-            *dict.fromkeys([*cost_network.in_keys, *variance_network.in_keys]),
-            keys.cost_target,
-            keys.variance_target,
-        ]
+        self.in_keys = self._regression_keys()
         self.out_keys = ["loss_cost_value", "loss_cost_variance"]
         self.make_value_estimator()
+
+    def _regression_keys(self) -> list[NestedKey]:
+        critics = [*self.cost_network.in_keys, *self.variance_network.in_keys]
+        return [
+            *dict.fromkeys(critics),
+            self.tensor_keys.cost_target,
+            self.tensor_keys.variance_target,
+        ]
 
     def _make_estimators(self, gamma: float, lmbda: float) -> None:
         super()._make_estimators(gamma, lmbda)
@@ -515,23 +556,24 @@ class CVaRSurrogateLoss(_SurrogateLoss):
         """
         keys = self.tensor_keys
         out = self._scored(tensordict, policy_log_prob)
-        mean, next_mean = (
-            self._value("cost_network", keys.cost_value, states)
-            for states in (tensordict, tensordict.get("next"))
+        steps = self._read_steps(tensordict, keys.cost, self._value_estimator)
+        (mean, next_mean), (variance, next_variance) = (
+            self._values(name, key, tensordict, steps.mask)
+            for name, key in (
+                ("cost_network", keys.cost_value),
+                ("variance_network", keys.cost_variance),
+            )
         )
-        variance, next_variance = (
-            self._value("variance_network", keys.cost_variance, states)
-            for states in (tensordict, tensordict.get("next"))
-        )
-        cost = tensordict.get(("next", keys.cost))
-        advantage = self._advantage(self._value_estimator, out, cost, mean, next_mean)
+        discount, _ = self._discount(tensordict, steps.reward, self._value_estimator)
+        advantage = self._advantage(self._value_estimator, out, steps, mean, next_mean)
 
         def second_order(reward: Callable[..., Tensor]) -> Tensor:
-            terminated = self._terminated(tensordict)
-            rewards = reward(self.gamma, cost, mean, next_mean, terminated)
-            return self._advantage(self._square_estimator, out, rewards, variance, next_variance)
+            rewards = reward(discount, steps.reward, mean, next_mean, steps.terminated)
+            return self._advantage(
+                self._square_estimator, out, steps._replace(reward=rewards), variance, next_variance
+            )
 
-        weight = self._weight(out)
+        weight = self._weight(out, mean)
         out.set(keys.cost_value, mean)
         out.set(keys.cost_advantage, advantage)
         out.set(keys.square_advantage, second_order(retrace_variance_reward))
@@ -555,36 +597,49 @@ class CVaRSurrogateLoss(_SurrogateLoss):
         mean = self._value("cost_network", keys.cost_value, tensordict)
         variance = self._value("variance_network", keys.cost_variance, tensordict)
         losses = {
-            "loss_cost_value": self._regression(mean, tensordict.get(keys.cost_target), tensordict),
-            "loss_cost_variance": self._regression(
-                variance, tensordict.get(keys.variance_target), tensordict
-            ),
+            "loss_cost_value": self._regression(mean, keys.cost_target, tensordict),
+            "loss_cost_variance": self._regression(variance, keys.variance_target, tensordict),
         }
         return TensorDict(losses, losses["loss_cost_value"].shape)
 
     @torch.no_grad()
-    def on_policy_moments(self, tensordict: TensorDictBase) -> CostMoments:
-        r"""Moments of the discounted cost of the policy that took the given steps.
+    def measure(self, tensordict: TensorDictBase) -> CostMoments:
+        r"""Where the cost of the policy stands that took the given steps, for :meth:`constraint`.
 
-        The mean is measured: mean cost per step over ``1 - gamma``. The variance is the critics',
+        The mean over the visited states is measured,
+        :func:`~torchrl_safe.objectives.value.visited_value_estimate`: where nothing terminates, it
+        is the mean cost per step over ``1 - gamma``. The variance is the critics',
         :math:`E[V] + Var[V_C]` over the visited states.
 
         Args:
-            tensordict (TensorDictBase): steps of the current policy, ``[*B]``.
+            tensordict (TensorDictBase): steps of the current policy in the order of time,
+                ``[*B, T]``, without n-step transitions.
 
         Returns:
             CostMoments: in units of the discounted cost sum, and in squared units.
+
+        Raises:
+            KeyError: if an entry is missing.
+            ValueError: if steps are sums of several.
         """
         keys = self.tensor_keys
-        mean = self._value("cost_network", keys.cost_value, tensordict)
-        variance = self._value("variance_network", keys.cost_variance, tensordict)
-        return CostMoments(
-            tensordict.get(("next", keys.cost)).mean() / (1 - self.gamma),
-            variance.mean() + mean.var(correction=0),
+
+        def next_value(tensordict: TensorDictBase) -> Tensor:
+            return self._next_value("cost_network", keys.cost_value, tensordict)
+
+        horizon, square_horizon = (
+            self._measured_horizon(tensordict, keys.cost, estimator)
+            for estimator in (self._value_estimator, self._square_estimator)
         )
+        mean = self._measured_mean(tensordict, keys.cost, self._value_estimator, next_value)
+        value = self._value("cost_network", keys.cost_value, tensordict).squeeze(-1)
+        variance = self._value("variance_network", keys.cost_variance, tensordict).squeeze(-1)
+        between = (value - self._mean(value, tensordict)).square()
+        variance = self._mean(variance + between, tensordict)
+        return CostMoments(mean, variance, horizon, square_horizon)
 
     def constraint(
-        self, tensordict: TensorDictBase, log_prob: Tensor, moments: CostMoments
+        self, tensordict: TensorDictBase, log_prob: Tensor, measured: CostMoments
     ) -> Tensor:
         """The constraint, ``Gamma - cost_limit``, feasible at or below 0.
 
@@ -592,29 +647,31 @@ class CVaRSurrogateLoss(_SurrogateLoss):
             tensordict (TensorDictBase): what :meth:`compute_advantage` returned, or some of it,
                 ``[*B]``.
             log_prob (Tensor): log-density of the stored actions under the new policy, ``[*B]``.
-            moments (CostMoments): of the policy that the advantages belong to, from
-                :meth:`on_policy_moments`.
+            measured (CostMoments): what :meth:`measure` returned for the policy that the advantages
+                belong to.
 
         Returns:
             The constraint, a scalar, in units of the discounted cost sum.
 
         Raises:
             KeyError: if there are no advantages in the data.
+            TypeError: if ``measured`` is something else.
         """
+        if not isinstance(measured, CostMoments):
+            raise TypeError(
+                f"measured must be what measure(...) returned, got {type(measured).__name__}."
+            )
         keys = self.tensor_keys
         advantage = self._computed(tensordict, keys.cost_advantage)
-        change = self._change(tensordict, log_prob, advantage, self.gamma)
-        mean = moments.mean + change
+        change = self._change(tensordict, log_prob, advantage, 0.0)  # of the mean cost per step
+        mean = measured.mean + measured.horizon * change
         if self.risk_level == 1:
             return mean - self.cost_limit
-        center = self._computed(tensordict, keys.cost_value).mean()
-        spread = self._computed(tensordict, keys.square_advantage) - 2 * center * advantage
-        shift = (1 - self.gamma) * change  # of the mean cost per step
-        variance = (
-            moments.variance
-            + self._change(tensordict, log_prob, spread, self.gamma**2)
-            - shift.square() / (1 - self.gamma**2)
-        )
+        center = self._computed(tensordict, keys.cost_value)
+        center = self._mean(center.squeeze(-1), tensordict)
+        deviation = self._computed(tensordict, keys.square_advantage) - 2 * center * advantage
+        deviation = self._change(tensordict, log_prob, deviation, 0.0) - change.square()
+        variance = measured.variance + measured.square_horizon * deviation
         # The root has no slope at 0; a variance this small has no part in a CVaR.
         std = variance.clamp(min=1e-8).sqrt()
         return gaussian_cvar(mean, std, self.risk_level) - self.cost_limit

@@ -10,6 +10,7 @@ from torchrl_safe.objectives.value.functional import (
     retrace_variance_reward,
     squared_td_error,
     tree_backup_lambda_return_estimate,
+    visited_value_estimate,
 )
 from torchrl_safe.objectives.value.policy import PolicyEvaluation, evaluate_policy
 
@@ -23,4 +24,5 @@ __all__ = [
     "retrace_variance_reward",
     "squared_td_error",
     "tree_backup_lambda_return_estimate",
+    "visited_value_estimate",
 ]

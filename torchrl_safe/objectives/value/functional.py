@@ -18,6 +18,7 @@ __all__ = [
     "retrace_variance_reward",
     "squared_td_error",
     "tree_backup_lambda_return_estimate",
+    "visited_value_estimate",
 ]
 
 _MAX_BLOCKS = 16  # of a recurrence; fewer are more rounds over all steps, more are many small steps
@@ -346,6 +347,106 @@ def squared_td_error(
     """
     one_step = _one_step_cost(gamma, cost, action_value, next_action_value, terminated)
     return (one_step - action_value).square()
+
+
+def visited_value_estimate(
+    gamma: float | Tensor,
+    reward: Tensor,
+    done: Tensor,
+    terminated: Tensor | None = None,
+    *,
+    next_value: Tensor | None = None,
+    mask: Tensor | None = None,
+    time_dim: int = -2,
+) -> Tensor:
+    r"""Mean value of the states that a policy visits, from the rewards that it met.
+
+    .. math::
+
+        \bar V = \frac{1}{N} \sum_t G_t, \qquad
+        G_t = r_t + \gamma \begin{cases}
+            0 & \text{terminated} \\
+            v + V(s_{t+1}) - \bar V_{cut} & \text{cut: truncated, or the data end} \\
+            G_{t+1} & \text{otherwise}
+        \end{cases}
+
+    How high values are is measured: what follows cuts is worth :math:`v` on average, the mean of
+    :math:`G` over the steps that trajectories start with, but for those that follow a termination.
+    A critic only says what cuts differ by. That is right where trajectories are cut as often in
+    one state as they are taken up in it, as a collector does it that goes on where its last batch
+    ended; a time limit is taken for such a cut, too.
+
+    Without terminations the result is the mean reward per step over ``1 - gamma``, whatever the
+    critic says. Where all trajectories terminate, it is the mean of their discounted sums.
+
+    Args:
+        gamma (float or Tensor): discount in [0, 1), a number.
+        reward (Tensor): ``[*B, T, F]``, floating point.
+        done (Tensor): boolean end of trajectory, ``[*B, T, F]``.
+        terminated (Tensor, optional): boolean end of episode, ``[*B, T, F]``. Defaults to ``done``.
+
+    Keyword Args:
+        next_value (Tensor, optional): a critic's :math:`V(s_{t+1})`, ``[*B, T, F]``. Read at cuts
+            only, elsewhere it may be NaN. Needed where some trajectories terminate and others are
+            cut: how long they have lasted tells how much is to come.
+        mask (Tensor, optional): false for padding, which may be NaN, ``[*B, T, F]`` boolean.
+        time_dim (int): the dimension of time, any but the last. Defaults to ``-2``.
+
+    Returns:
+        Tensor: the mean over steps and features, a scalar.
+
+    Raises:
+        TypeError: if ``done`` or ``terminated`` is not boolean.
+        ValueError: if shapes disagree, or ``gamma`` is outside [0, 1].
+
+    Examples:
+        An episode of two steps, and one that goes on:
+
+        >>> import torch
+        >>> reward, done = torch.ones(2, 1), torch.tensor([[False], [True]])
+        >>> visited_value_estimate(0.5, reward, done)  # 1.5 and 1
+        tensor(1.2500)
+        >>> visited_value_estimate(0.5, reward, torch.zeros_like(done))  # 1 / (1 - .5)
+        tensor(2.)
+
+    """
+    terminated = done if terminated is None else terminated
+    if mask is None:
+        mask = torch.ones_like(reward, dtype=torch.bool)
+    if next_value is None:
+        next_value = torch.zeros_like(reward)
+    _check_shape("next_value", next_value, reward.shape, "that of reward")
+    _check_shape("mask", mask, reward.shape, "that of reward")
+    _check_shape("done", done, reward.shape, "that of reward")
+    _check_shape("terminated", terminated, reward.shape, "that of reward")
+    _check_boolean("done", done)
+    _check_boolean("terminated", terminated)
+    ends = done | terminated | ~_shift(mask, -1, time_dim)
+    cut = mask & ends & ~terminated
+    starts = mask & ~_shift(mask & (~ends | terminated), 1, time_dim)
+
+    def sums(reward: Tensor, value: Tensor) -> Tensor:
+        nothing = torch.zeros_like(reward)
+        return q_lambda_return_estimate(
+            gamma, 1.0, nothing, value, reward, ends, terminated, time_dim=time_dim
+        )
+
+    def mean(tensor: Tensor, where: Tensor) -> Tensor:
+        return torch.where(where, tensor, 0).sum() / where.sum().clamp(min=1)
+
+    reward = torch.where(mask, reward, 0)
+    paid = sums(reward, torch.where(cut, next_value - mean(next_value, cut), 0))
+    share = sums(torch.zeros_like(reward), cut.to(reward.dtype))  # of v in G
+    value = mean(paid, starts) / (1 - mean(share, starts))
+    return mean(paid + share * value, mask)
+
+
+def _shift(tensor: Tensor, steps: int, time_dim: int) -> Tensor:
+    """A boolean tensor later (or earlier) in time by a step, with false where there was none."""
+    tensor = tensor.movedim(time_dim, 0)
+    none = torch.zeros_like(tensor[:1])
+    parts = [none, tensor[:-1]] if steps > 0 else [tensor[1:], none]
+    return torch.cat(parts).movedim(0, time_dim)
 
 
 def _one_step_cost(

@@ -12,7 +12,8 @@ from torchrl.modules import MLP, NormalParamExtractor, ProbabilisticActor, TanhN
 from torchrl.modules.tensordict_module import SafeModule
 from torchrl.testing.mocking_classes import ContinuousActionVecMockEnv
 
-from torchrl_safe import CVaRCostLoss, GMMTanhPolicy, TsallisLoss
+from torchrl_safe import CVaRCostLoss, GMMTanhPolicy, RetraceEstimator, TsallisLoss
+from torchrl_safe.objectives import ReturnSurrogateLoss
 from torchrl_safe.objectives.value import evaluate_policy
 from torchrl_safe.objectives.value.utils import behaviour_log_prob
 
@@ -218,3 +219,31 @@ def test_random_frames_of_a_real_collector():
     assert not data["action_log_prob"].any()
     log_mu = behaviour_log_prob(data, "action_log_prob", policy)
     torch.testing.assert_close(log_mu, torch.full((20,), -spec.shape[-1] * math.log(2.0)))
+
+
+@pytest.mark.parametrize("bias", [0.0, 12.0])
+def test_a_policy_on_its_own_data(bias):
+    """However saturated: Retrace(1) is the discounted return, and no step is no change."""
+    torch.manual_seed(0)
+    actor = GMMTanhPolicy(nn.Linear(OBS, 3), Bounded(-1, 1, (1,)), num_components=1)
+    nn.init.constant_(actor[0].module[0].bias[1:2], bias)
+    no = torch.zeros(4, 50, 1, dtype=torch.bool)
+    following = {"observation": torch.randn(4, 50, OBS), "reward": torch.randn(4, 50, 1)}
+    data = TensorDict(
+        {"observation": torch.randn(4, 50, OBS), "next": {**following, "done": no}}, [4, 50]
+    )
+    data = actor(data).detach()
+    data["state_action_value"] = data["next", "state_value"] = torch.zeros(4, 50, 1)
+    estimator = RetraceEstimator(gamma=0.9, lmbda=1.0, actor_network=actor)
+    discounts = 0.9 ** torch.arange(50.0).unsqueeze(-1)
+    expected = (discounts * data["next", "reward"]).sum(1)
+    torch.testing.assert_close(estimator.value_estimate(data)[:, 0], expected)
+
+    loss = ReturnSurrogateLoss(ValueOperator(MLP(OBS, 1, num_cells=[8])))
+    policy = evaluate_policy(data, actor)
+    steps = loss.compute_advantage(data, policy_log_prob=policy.log_prob)
+    log_prob = actor.get_dist(steps).log_prob(steps["action"])
+    change = loss.objective(steps, log_prob)
+    assert change.item() == pytest.approx(0, abs=1e-4)
+    change.backward()
+    assert actor[0].module[0].weight.grad.abs().sum() > 1e-3

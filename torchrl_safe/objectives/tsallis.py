@@ -110,7 +110,7 @@ class TsallisLoss(SACLoss):
         >>> actor = GMMTanhPolicy(MLP(3, 5, num_cells=[8]), spec, num_components=1)
         >>> qvalue = ValueOperator(MLP(3 + 2, 1, num_cells=[8]), in_keys=["observation", "action"])
         >>> loss = TsallisLoss(actor, qvalue, entropic_index=1.5)
-        >>> loss.make_value_estimator(gamma=0.99)
+        >>> _ = loss.make_value_estimator(gamma=0.99)
         >>> target_updater = SoftUpdate(loss, tau=0.005)
         >>> data = TensorDict(
         ...     {

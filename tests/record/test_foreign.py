@@ -61,9 +61,9 @@ class TestForeignEnvironments:
 
     def test_several_costs(self):
         env = self.make({"count": "cost", "speed": "speed"}, violation_above=3.0)
-        with pytest.raises(KeyError, match="cost.* is missing; .*count_cost.*speed_cost"):
+        with pytest.raises(KeyError, match=r"cost.* is missing; .*count_cost.*speed_cost"):
             batch_metrics(env.rollout(2))
-        with pytest.raises(KeyError, match="violation.* is missing; .*count_violation"):
+        with pytest.raises(KeyError, match=r"violation.* is missing; .*count_violation"):
             self.judge(env)
         names = ["count_cost", "count_violation"], ["cost", "violation"]
         env.append_transform(RenameTransform(*names))

@@ -7,6 +7,7 @@ import shutil
 import subprocess
 import sys
 import threading
+import time
 from collections import OrderedDict
 from pathlib import Path
 from types import SimpleNamespace
@@ -241,9 +242,9 @@ class TestBesideATraining:
         cfg = read_config(run_dir / "config.yaml")
 
         def write():
-            for _ in range(2):
-                evaluate.main(run_dir, episodes=1, seed=5, film=False)
-                watch.look(run_dir)
+            evaluate.main(run_dir, episodes=1, seed=5, film=False)
+            watch.look(run_dir)
+            for _ in range(100):
                 write_config(run_dir / "config.yaml", cfg)
 
         writer = threading.Thread(target=write)
@@ -254,6 +255,7 @@ class TestBesideATraining:
                 assert path.read_bytes().endswith(end), path
             assert read_config(run_dir / "config.yaml") == cfg
             reads += 1
+            time.sleep(0.001)
         writer.join()
         assert reads > 10
 

@@ -194,9 +194,15 @@ def _read_points(file: Path) -> list[tuple[int, float]]:
 
 def _draw(axes: Axes, metrics: Curves, name: str, label: str, **style: object) -> None:
     if name in metrics:
+        steps, values = metrics[name]
         # One point has no line to show.
-        marker = "o" if len(metrics[name][0]) == 1 else ""
-        axes.plot(*metrics[name], label=label, marker=marker, **style)  # type: ignore[arg-type]
+        marker = "o" if len(steps) == 1 else ""
+        axes.plot(steps, _drawable(values), label=label, marker=marker, **style)  # type: ignore[arg-type]
+
+
+def _drawable(values: np.ndarray) -> np.ndarray:
+    """Values with gaps where there is no number, or one of which no axis can be made."""
+    return np.where(np.abs(values) < 1e100, values, np.nan)
 
 
 def _shade(axes: Axes, metrics: Curves, low: str, high: str, colour: str) -> None:
@@ -206,8 +212,8 @@ def _shade(axes: Axes, metrics: Curves, low: str, high: str, colour: str) -> Non
         )
         axes.fill_between(
             steps,
-            metrics[low][1][at_low],
-            metrics[high][1][at_high],
+            _drawable(metrics[low][1][at_low]),
+            _drawable(metrics[high][1][at_high]),
             color=colour,
             alpha=0.15,
             lw=0,

@@ -1,6 +1,6 @@
 """Share of steps that the trust region refuses: random linear problems, and a small mixture policy.
 
-``python benchmarks/trust_region_refusals.py``, half a minute.
+``python benchmarks/trust_region_refusals.py``, some minutes on one core.
 """
 
 from __future__ import annotations

@@ -292,7 +292,9 @@ class TestTogether:
         renderer = SceneRenderer(core, 64, 48)
         for _ in range(2):  # before it has drawn, and after
             twin = duplicate(renderer)
-            assert (twin.draw(1) == renderer.draw(1)).all()
+            pictures = np.array([twin.draw(1), renderer.draw(1)], int)
+            assert pictures.std((1, 2, 3)).min() > 5
+            assert np.abs(pictures[0] - pictures[1]).mean() < 5
             twin.close()
         renderer.close()
         assert renderer.draw(1).std() > 5  # closed is not broken

@@ -37,6 +37,7 @@ _DIVERGED = [
 ]
 # MuJoCo's derived fields lag behind the state by one physics step, unless it is asked for them.
 _ACCELERATION = mujoco.mjtStage.mjSTAGE_ACC.value
+_PHYSICS = ("time", "qpos", "qvel", "act")
 
 
 class RobotBatch:
@@ -143,9 +144,13 @@ class RobotBatch:
         batch = self.batch
         batch.state[rows] = self._initial
         self._qpos[rows] = self.robot.place(position, yaw)
-        batch.forward(rows)
         if self.commands is not None:
             self.commands = _with_rows(self.commands, rows, np.zeros(1))
+        self.perceive(rows)
+
+    def perceive(self, rows: Rows) -> None:
+        """Evaluates what the robots ``rows`` sense where they are now."""
+        self.batch.forward(rows)
         pairs = zip(self.motion, self._sense(rows), strict=True)
         self.motion = Motion(*(_with_rows(old, rows, new) for old, new in pairs))
 
@@ -388,6 +393,38 @@ class Core:
     def close(self) -> None:
         """Ends the simulator's threads; steps, resets and snapshots raise from then on."""
         self._robots.close()
+
+    def physics(self) -> dict[str, Array]:
+        """Copies of what the simulator goes on from, [N, ...] each, by MuJoCo's names."""
+        return {name: np.array(self._robots.batch.bind(name)) for name in _PHYSICS}
+
+    def move(self, physics: dict[str, Array]) -> None:
+        """Puts the robots somewhere else; the frame shows what they meet there.
+
+        The way there is not judged: a reached goal moves without a reward.
+
+        Args:
+            physics (dict of arrays): as :meth:`physics` returns it.
+        """
+        for name, value in physics.items():
+            self._robots.batch.bind(name)[:] = value
+        self._robots.perceive(self._rows)
+        robot, motion = self.robot, self._robots.motion
+        sensed = self.task.sense(robot, motion, self._objects)
+        remaining = np.maximum(self.episode_length - self._elapsed, 0)
+        moved = self.task.advance(robot, motion, self._objects, sensed, remaining, self._streams)
+        self._objects = moved.objects
+        self._frame = self._frame._replace(
+            observation=self._observe(self._rows, motion, self._objects, sensed.scan),
+            cost=sensed.cost,
+            violation=sensed.violation,
+            violations=sensed.violation.astype(np.int64),
+        )
+
+    @property
+    def started(self) -> bool:
+        """Whether there was a reset."""
+        return self._started
 
     def layout(self, index: int) -> dict[str, Array]:
         """Copies of robot [2], heading [2] and the task's objects of one environment, metres."""

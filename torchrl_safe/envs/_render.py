@@ -21,6 +21,7 @@ from torchrl_safe.envs.robots import Array
 from torchrl_safe.envs.tasks import Prop
 
 _RED = (1.0, 0.10, 0.10, 0.90)
+_YELLOW = (1.0, 0.95, 0.20, 1.0)
 _RAY = (0.95, 0.75, 0.10, 0.60)
 _RAY_HEIGHT = 0.12  # metres above the floor
 _ELEVATION = -70.0  # degrees, of the camera
@@ -171,6 +172,9 @@ class Scene:
         self.data = mujoco.MjData(self.model)
         self._mocap = [self.model.body(name).mocapid.item() for name in props]
         self._hazards = [self.model.geom(name).id for name in hazards]
+        body = self.model.geom_bodyid
+        self._robot = np.flatnonzero((body > 0) & (self.model.body_mocapid[body] < 0))
+        self._robot_colours = self.model.geom_rgba[self._robot].copy()
         self._colours = self.model.geom_rgba[self._hazards].copy()
 
     def show(self, index: int) -> None:
@@ -190,6 +194,11 @@ class Scene:
                 offset = data.geom_xpos[self._hazards, :2] - layout["robot"]
                 nearest = np.hypot(*offset.T).argmin()
                 model.geom_rgba[self._hazards[nearest]] = _RED
+
+    def highlight(self, share: float) -> None:
+        """Colours the robot: 0 as in its file, 1 all yellow."""
+        colours = (1.0 - share) * self._robot_colours + share * np.array(_YELLOW)
+        self.model.geom_rgba[self._robot] = colours
 
     def ray_ends(self, index: int) -> Array:
         """Where the lidar's rays of environment ``index`` hit something: [K, 2]."""
@@ -323,7 +332,7 @@ def _offscreen_context(width: int, height: int) -> Any:
         from OpenGL import EGL
 
         context = GLContext(width, height)
-        # MuJoCo ends EGL at exit, for everybody: dm_control may not have freed its contexts by then.
+        # It ends EGL at exit, for everybody: dm_control may not have freed its contexts by then.
         atexit.unregister(EGL.eglTerminate)
         return context
     from mujoco.gl_context import GLContext

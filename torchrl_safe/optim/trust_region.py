@@ -289,7 +289,7 @@ class TrustRegionSafeOptimizer(torch.optim.Optimizer):
 
     # Solving the subproblem is no work for a compiler, nor is a graph that is differentiated twice.
     @torch.compiler.disable
-    def step(self, closure: Closure) -> TrustRegionReport:  # type: ignore[override]
+    def step(self, closure: Closure) -> TrustRegionReport:
         """Take one step.
 
         Args:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import gc
 import math
+import os
 from copy import copy
 from dataclasses import replace
 
@@ -419,3 +421,40 @@ def test_car_drives():
     moved = env.layout(0)["robot"] - before[0]["robot"]
     assert moved @ before[0]["heading"] > 0.1
     assert td["next", "observation"][1, 7] * 2.0 > 0.5
+
+
+def num_threads() -> int:
+    return len(os.listdir("/proc/self/task"))
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
+@pytest.mark.parametrize("name", ROBOTS)
+def test_a_forked_process_goes_on_alike(name):
+    env, twin = (SafeGoalEnv(name, num_envs=4, num_threads=3) for _ in range(2))
+    td = TensorDict({"action": torch.full(env.action_spec.shape, 0.3)}, [4])
+    for each in (env, twin):
+        each.reset()
+        each.step(td.clone())
+    expected = twin.step(td.clone())["next", "observation"].numpy()
+    child = os.fork()
+    if not child:
+        # numpy alone: torch's own threads are the parent's, too
+        frame = env._core.step(td["action"].numpy())
+        os._exit(0 if (frame.observation == expected).all() else 1)
+    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
+    assert (env.step(td.clone())["next", "observation"].numpy() == expected).all()
+
+
+@pytest.mark.skipif(not os.path.isdir("/proc/self/task"), reason="needs /proc")
+def test_close_ends_the_threads():
+    gc.collect()  # of what other tests left
+    before = num_threads()
+    env = SafeGoalEnv("point", num_envs=8, num_threads=4)
+    td = env.rollout(2)[:, -1]
+    assert num_threads() == before + 3
+    env.close()
+    assert num_threads() == before
+    for use in (env.reset, lambda: env.step(td), env.state_dict, env.render):
+        with pytest.raises(RuntimeError, match="the environment is closed"):
+            use()
+    env.close()

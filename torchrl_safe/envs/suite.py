@@ -85,7 +85,11 @@ def load(
     """
     if isinstance(task, str) and task != "goal":
         raise ValueError(f"task must be 'goal' or a Task, got {task!r}.")
-    options = {"random": random, "episode_length": episode_length, "randomization": randomization}
+    options: dict[str, Any] = {
+        "random": random,
+        "episode_length": episode_length,
+        "randomization": randomization,
+    }
     unknown = (task_kwargs or {}).keys() - options.keys()
     if unknown:
         raise TypeError(

@@ -287,8 +287,8 @@ bad(
 
 priced = partial(lagrangian, zeros(), constraint=zeros(2), multiplier=zeros(2))
 for name, wrong, allowed in (
-    ("multiplier", [1.0, -2.0], "finite number, at least 0"),
-    ("multiplier", [1.0, INF], "finite number, at least 0"),
+    ("multiplier", [1.0, -2.0], "finite and at least 0"),
+    ("multiplier", [1.0, INF], "finite and at least 0"),
     ("constraint", [NAN, 1.0], "finite"),
 ):
     call = partial(priced, **{name: torch.tensor(wrong)})

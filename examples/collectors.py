@@ -34,7 +34,7 @@ def make_collector(
     policy: Callable[[TensorDictBase], TensorDictBase],
     *,
     seed: int,
-    total_frames: int,
+    total_frames: int = -1,
 ) -> BaseCollector:
     """A collector of batches ``[N, T]`` from ``env.num_envs`` environments.
 
@@ -56,7 +56,7 @@ def make_collector(
 
     Keyword Args:
         seed (int): of the environments; workers derive theirs from it.
-        total_frames (int): when to stop.
+        total_frames (int): when to stop, which closes the environment. Defaults to never.
 
     Raises:
         ValueError: if the backend is unknown, or the workers cannot share the environments equally.

@@ -210,7 +210,7 @@ def run_doggo(run: Run) -> None:
         ),
         actor,
         frames_per_batch=cfg.collector.frames_per_batch,
-        total_frames=cfg.collector.total_frames,
+        total_frames=-1,  # or it closes its environment, which is to be saved
         exploration_type=ExplorationType.RANDOM,
         auto_register_policy_transforms=False,
     )
@@ -254,7 +254,7 @@ def run_doggo(run: Run) -> None:
             if run.frames >= next_save or stop.requested:
                 next_save += cfg.checkpoint.interval
                 run.save()
-            if stop.requested:
+            if stop.requested or not run.frames_left:
                 break
     progress.close()
     if not stop.requested:

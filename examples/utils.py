@@ -130,7 +130,6 @@ def train(
         make_training_env,
         policy,
         seed=stream_seed("training", cfg.seed, run.frames),
-        total_frames=run.frames_left or cfg.collector.frames_per_batch,
     )
     with GracefulStop() as stop, closing_down(collector):
         if in_process:
@@ -210,7 +209,7 @@ def _train(
         if run.frames >= next_save:
             next_save += cfg.checkpoint.interval
             run.save()
-        if stop.requested:
+        if stop.requested or not run.frames_left:
             break
         # After the log: where a worker has died meanwhile, the update is saved and logged.
         collector.update_policy_weights_()

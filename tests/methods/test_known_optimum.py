@@ -258,7 +258,7 @@ def mean_action(policy: GMMTanhPolicy) -> Tensor:
 
 METHODS = {
     "cpo": (OnPolicy, TrustRegion, 30),
-    "safetac": (OffPolicyBlocks, TrustRegion, 90),
+    "safetac": (OffPolicyBlocks, TrustRegion, 150),
     "on_policy_lagrangian": (OnPolicy, Lagrangian, 150),
     "on_policy_pid": (OnPolicy, PID, 150),
     "safetac_lagrangian": (OffPolicyBlocks, Lagrangian, 150),

@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from checkpoints import load_components
 from collectors import WorkerDied, make_collector
 from omegaconf import DictConfig
 from run import Run
@@ -28,11 +29,13 @@ from terminal import GracefulStop, progress_bar, say
 from torch import nn
 from torchrl._utils import logger as torchrl_logger
 from torchrl._utils import timeit
+from torchrl.checkpoint import CheckpointError
 from torchrl.collectors import BaseCollector
 from torchrl.envs import EnvBase
 from torchrl.modules import MLP, ValueOperator
 
 from torchrl_safe import GMMTanhPolicy
+from torchrl_safe._files import printable
 from torchrl_safe.envs import RANDOMIZATIONS, SafeGoalEnv
 from torchrl_safe.record import batch_metrics, count_violations
 
@@ -246,3 +249,11 @@ def saved_policy(cfg: DictConfig, checkpoint: Path) -> GMMTanhPolicy:
     Raises:
         CheckpointError: if it is not what was written, or not finite.
     """
+    if "policy" not in cfg:
+        raise CheckpointError(f"{printable(checkpoint)} has no mixture policy.")
+    policy = make_policy(cfg, make_env(cfg, num_envs=1, seed=0))
+    load_components(checkpoint, policy=policy)
+    for name, weight in policy.named_parameters():
+        if not weight.isfinite().all():
+            raise CheckpointError(f"{name} of the policy in {printable(checkpoint)} is not finite.")
+    return policy.eval().requires_grad_(False)

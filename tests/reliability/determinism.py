@@ -35,6 +35,7 @@ from torchrl.modules import MLP  # noqa: E402
 from torchrl_safe import GMMTanhPolicy  # noqa: E402
 from torchrl_safe.record import read_metrics  # noqa: E402
 
+ENDS = ("terminated", "truncated", "running")
 TIMES = {"seconds", "frames_per_second"}
 SAFETAC = ["collector.total_frames=300", "lagrangian.minibatch_size=50"]
 # Two updates; one evaluation and one checkpoint, in the end.
@@ -110,6 +111,8 @@ def numbers(folder: Path) -> dict[str, np.ndarray]:
         episodes = results.pop("episodes")
         found |= {name: np.array(value) for name, value in results.items() if name not in TIMES}
         for kind, played in episodes.items():
+            for each in played:
+                each["end"] = ENDS.index(each["end"])
             for name in played[0]:
                 found[f"{kind}episodes, {name}"] = np.array([each[name] for each in played])
     if (folder / "curves.csv").exists():

@@ -144,7 +144,7 @@ def test_an_error_ends_the_workers(tmp_path, monkeypatch, patience, backend):
     ("overrides", "width"),
     [
         (["env.num_envs=2"], 2),
-        (["collector.backend=multi_sync", "env.num_envs=20"], 20),
+        (["collector.backend=multi_sync", "env.num_envs=10"], 10),
         (["collector.backend=multi_async"], 2),
     ],
 )

@@ -1441,6 +1441,7 @@ CONFIGS = sorted(path.stem for path in EXAMPLES.glob("*.yaml"))
 
 # One impossible value for each option of each example, and what its message says is allowed.
 IMPOSSIBLE = {
+    "script": ("unknown", "'safetac_point'"),
     "seed": (-1, "at least 0"),
     "num_threads": (0, "at least 1"),
     "run_dir": ("", "a path"),

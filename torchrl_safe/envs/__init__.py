@@ -8,7 +8,6 @@ suite``.
 
 from __future__ import annotations
 
-from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 from torchrl_safe.envs.adapters import CostToReward, cost_from_info
@@ -47,13 +46,17 @@ __all__ = [
     "get_robot",
 ]
 
-_NEED_MUJOCO = {"SafeGoalEnv": "goal", "GymGoalEnv": "gymnasium", "GymGoalVectorEnv": "gymnasium"}
-
 
 def __getattr__(name: str) -> Any:
-    if name not in _NEED_MUJOCO:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(import_module(f"{__name__}.{_NEED_MUJOCO[name]}"), name)
+    if name == "SafeGoalEnv":
+        from torchrl_safe.envs.goal import SafeGoalEnv
+
+        return SafeGoalEnv
+    if name in ("GymGoalEnv", "GymGoalVectorEnv"):
+        from torchrl_safe.envs import gymnasium
+
+        return getattr(gymnasium, name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 
 def __dir__() -> list[str]:

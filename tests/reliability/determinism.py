@@ -109,7 +109,7 @@ def numbers(folder: Path) -> dict[str, np.ndarray]:
     if (folder / "results.json").exists():
         results = json.loads((folder / "results.json").read_text())
         episodes = results.pop("episodes")
-        found |= {name: np.array(value) for name, value in results.items() if name not in TIMES}
+        found |= {n: np.array(v, float) for n, v in results.items() if n not in TIMES}
         for kind, played in episodes.items():
             for each in played:
                 each["end"] = ENDS.index(each["end"])

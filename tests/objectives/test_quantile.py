@@ -299,7 +299,9 @@ class TestCritic:
             optim.step()
         learned = critic.module.values.detach().sort().values
         assert (learned - exact).abs().max() < 0.1
-        assert quantile_cvar(learned, 0.25).item() == pytest.approx(exact[-2:].mean().item(), rel=0.03)
+        assert quantile_cvar(learned, 0.25).item() == pytest.approx(
+            exact[-2:].mean().item(), rel=0.03
+        )
 
     def test_gradient_isolation(self):
         loss = make_loss()

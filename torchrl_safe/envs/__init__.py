@@ -22,32 +22,47 @@ from torchrl_safe.envs.randomization import (
 from torchrl_safe.envs.registration import register_envs
 from torchrl_safe.envs.robots import ROBOTS, Robot, get_robot
 from torchrl_safe.envs.tasks import GoalTask, NavigationTask
+from torchrl_safe.envs.tasks.velocity import VELOCITY_TASKS, VelocityTask
 from torchrl_safe.envs.transforms import SafeFrameSkip
 
 if TYPE_CHECKING:
     from torchrl_safe.envs.goal import SafeGoalEnv
     from torchrl_safe.envs.gymnasium import GymGoalEnv, GymGoalVectorEnv
+    from torchrl_safe.envs.velocity import SafeVelocityEnv
+    from torchrl_safe.envs.velocity_gymnasium import GymVelocityEnv, GymVelocityVectorEnv
 
 __all__ = [
     "JACKAL_REAL",
     "JACKAL_TRAINING",
     "RANDOMIZATIONS",
     "ROBOTS",
+    "VELOCITY_TASKS",
     "CostToReward",
     "GoalTask",
     "GymGoalEnv",
     "GymGoalVectorEnv",
+    "GymVelocityEnv",
+    "GymVelocityVectorEnv",
     "NavigationTask",
     "Randomization",
     "Robot",
     "SafeFrameSkip",
     "SafeGoalEnv",
+    "SafeVelocityEnv",
+    "VelocityTask",
     "check_safe_env",
     "cost_from_info",
     "get_robot",
 ]
 
-_NEED_MUJOCO = {"SafeGoalEnv": "goal", "GymGoalEnv": "gymnasium", "GymGoalVectorEnv": "gymnasium"}
+_NEED_MUJOCO = {
+    "SafeGoalEnv": "goal",
+    "GymGoalEnv": "gymnasium",
+    "GymGoalVectorEnv": "gymnasium",
+    "SafeVelocityEnv": "velocity",
+    "GymVelocityEnv": "velocity_gymnasium",
+    "GymVelocityVectorEnv": "velocity_gymnasium",
+}
 
 
 def __getattr__(name: str) -> Any:

@@ -47,6 +47,7 @@ class RunnerBatch(SimulationPool):
 
     def __init__(self, task: VelocityTask, num_envs: int, num_threads: int) -> None:
         model = mujoco.MjModel.from_xml_path(str(task.asset_path))
+        model.geom_margin[:] *= task.margin_scale
         names = (*task.measured, *task.observed)
         # MuJoCo sums up contact forces only if it is asked to, after a step and of its MjData.
         super().__init__(model, num_envs, num_threads, persistent="cfrc_ext" in names)

@@ -22,7 +22,7 @@ from torchrl_safe.envs.randomization import (
 from torchrl_safe.envs.registration import register_envs
 from torchrl_safe.envs.robots import ROBOTS, Robot, get_robot
 from torchrl_safe.envs.tasks import GoalTask, NavigationTask
-from torchrl_safe.envs.tasks.velocity import VELOCITY_TASKS, VelocityTask
+from torchrl_safe.envs.tasks.velocity import VELOCITY_TASKS, VelocityTask, get_velocity_task
 from torchrl_safe.envs.transforms import SafeFrameSkip
 
 if TYPE_CHECKING:
@@ -53,6 +53,7 @@ __all__ = [
     "check_safe_env",
     "cost_from_info",
     "get_robot",
+    "get_velocity_task",
 ]
 
 _NEED_MUJOCO = {

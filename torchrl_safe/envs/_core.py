@@ -1,7 +1,8 @@
 """The simulator behind every face of the environments: numpy in, numpy out, N at a time.
 
 This is the only file that touches MuJoCo's thread pool. It moves robots and keeps episodes; what
-is around the robots belongs to the task, as arrays and not as bodies in the physics model.
+is around the robots belongs to the task: arrays, which for a task with bodies say where in the
+physics model these start.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ import numpy as np
 from mujoco.batch import Batch, SimulationError
 from numpy.typing import NDArray
 
+from torchrl_safe.envs._model import compile_model, pose, state_addresses
 from torchrl_safe.envs._process import keep_forever
 from torchrl_safe.envs._random import RandomStreams
 from torchrl_safe.envs.randomization import (
@@ -26,6 +28,7 @@ from torchrl_safe.envs.randomization import (
 )
 from torchrl_safe.envs.robots import Array, Motion, Robot, get_robot
 from torchrl_safe.envs.tasks import TASKS, Objects, Task
+from torchrl_safe.envs.tasks.bodies import Bodies
 
 Rows = NDArray[np.integer]
 Mask = NDArray[np.bool_]
@@ -37,6 +40,7 @@ _DIVERGED = [
 ]
 # MuJoCo's derived fields lag behind the state by one physics step, unless it is asked for them.
 _ACCELERATION = mujoco.mjtStage.mjSTAGE_ACC.value
+_NOTHING = mujoco.mjtStage.mjSTAGE_NONE.value
 _PHYSICS = ("time", "qpos", "qvel", "act")
 
 
@@ -52,6 +56,7 @@ class RobotBatch:
         num_threads (int): threads that step them, this one included.
         max_delay (int, optional): most environment steps a command can be late by. ``None`` for
             robots that are all as their model, which is cheaper.
+        bodies (tuple of Body, optional): what is around them in the physics model.
 
     Attributes:
         motion (Motion): where the robots are and what they sense. Accelerations are evaluated once
@@ -61,21 +66,31 @@ class RobotBatch:
     """
 
     def __init__(
-        self, robot: Robot, num_envs: int, num_threads: int, max_delay: int | None = None
+        self,
+        robot: Robot,
+        num_envs: int,
+        num_threads: int,
+        max_delay: int | None = None,
+        bodies: Bodies | None = None,
     ) -> None:
         self.robot = robot
         self.num_envs = num_envs
         self.num_threads = num_threads
-        plane = np.zeros((num_envs, 2))
-        self.motion = Motion(plane, plane, np.zeros((num_envs, len(robot.proprioception_scale))))
+        self.bodies = bodies or ()
         self.variation: Variation | None = None
         self.commands: Array | None = None
-        self._model = mujoco.MjModel.from_xml_path(str(robot.asset_path))
-        self._model.opt.timestep = robot.timestep
+        self._model = model = compile_model(robot, bodies)
+        self._addresses = [state_addresses(model, body) for body in self.bodies]
+        self._towed = any(body.hold == "towed" for body in self.bodies)
+        # The sensors that a robot's own file may have are not read.
+        self._num_sensors = 0 if bodies is None else model.nsensordata
+        plane, size = np.zeros((num_envs, 2)), len(robot.proprioception_scale)
+        readings = np.zeros((num_envs, self._num_sensors))
+        self.motion = Motion(plane, plane, np.zeros((num_envs, size)), readings)
         if max_delay is not None:
             one, zero = np.ones(num_envs), np.zeros(num_envs)
             self.variation = Variation(one, one, one, zero, zero, zero)
-            self.commands = np.zeros((num_envs, max_delay + 1, self._model.nu))
+            self.commands = np.zeros((num_envs, max_delay + 1, model.nu))
         self._batch: Batch | None = None
         self._saved: Array | None = None
         self._closed = False
@@ -96,6 +111,8 @@ class RobotBatch:
             self._qpos, self._qvel = batch.bind("qpos"), batch.bind("qvel")
             self._time = batch.bind("time")
             self._ctrl, self._qacc = batch.bind("ctrl"), batch.bind("qacc")
+            self._mocap_pos, self._mocap_quat = batch.bind("mocap_pos"), batch.bind("mocap_quat")
+            self._sensors = batch.bind("sensordata") if self._num_sensors else self.motion.sensors
             self._warning = batch.warning
             self._before = np.empty_like(batch.state)
             if self.variation is not None:
@@ -107,6 +124,7 @@ class RobotBatch:
 
     def __getstate__(self) -> dict[str, Any]:
         bound = ("_initial", "_qpos", "_qvel", "_time", "_ctrl", "_qacc", "_warning", "_before")
+        bound += ("_mocap_pos", "_mocap_quat", "_sensors")
         kept = {name: value for name, value in self.__dict__.items() if name not in bound}
         saved = self._saved if self._batch is None else self._batch.state.copy()
         return kept | {"_batch": None, "_saved": saved}
@@ -139,14 +157,48 @@ class RobotBatch:
         batch.expand("actuator_gainprm")[rows] = model.actuator_gainprm * gain[..., None]
         batch.set_const(rows)
 
-    def place(self, rows: Rows, position: Array, yaw: Array) -> None:
-        """Puts the robots ``rows`` at rest at position [n, 2] and yaw [n]."""
+    def place(
+        self, rows: Rows, position: Array, yaw: Array, objects: Objects | None = None
+    ) -> None:
+        """Puts the robots ``rows`` at rest at position [n, 2] and yaw [n], and bodies around."""
         batch = self.batch
         batch.state[rows] = self._initial
-        self._qpos[rows] = self.robot.place(position, yaw)
+        qpos = self.robot.place(position, yaw)
+        self._qpos[rows, : qpos.shape[1]] = qpos
+        self._place_bodies(rows, objects or {})
         if self.commands is not None:
             self.commands = _with_rows(self.commands, rows, np.zeros(1))
         self.perceive(rows)
+
+    def _place_bodies(self, rows: Rows, objects: Objects) -> None:
+        """At rest at ``objects[name]`` [n, K, 2], turned by ``objects[name + "_yaw"]`` [n, K]."""
+        column = rows[:, None]
+        for body, where in zip(self.bodies, self._addresses, strict=True):
+            xyz, quaternion = pose(body, objects[body.name], objects.get(f"{body.name}_yaw"))
+            if "qpos" in where:
+                index = where["qpos"][:, None] + np.arange(7)
+                self._qpos[rows[:, None, None], index] = np.concatenate((xyz, quaternion), -1)
+            if "anchor" in where:
+                xyz[..., 2] = 0.0
+                self._mocap_pos[column, where["anchor"]] = xyz
+            if "mocap" in where:
+                self._mocap_pos[column, where["mocap"]] = xyz
+                self._mocap_quat[column, where["mocap"]] = quaternion
+
+    def _tow(self) -> None:
+        """Moves what tows bodies to where it is at this time."""
+        time = self._time[:, None]
+        for body, where in zip(self.bodies, self._addresses, strict=True):
+            if body.hold == "towed":
+                offset = np.stack(
+                    (
+                        body.travel * np.sin(time),
+                        body.travel * np.cos(time),
+                        np.full_like(time, body.lift),
+                    ),
+                    -1,
+                )
+                self._mocap_pos[:, where["mocap"]] = self._mocap_pos[:, where["anchor"]] + offset
 
     def perceive(self, rows: Rows) -> None:
         """Evaluates what the robots ``rows`` sense where they are now."""
@@ -164,11 +216,17 @@ class RobotBatch:
         np.copyto(self._before, batch.state)
         command = self.robot.control(action, self._qpos, self._qvel, self._time)
         self._ctrl[:] = self._late(command)
-        try:
-            batch.step(nstep=self.robot.substeps, stage=_ACCELERATION)
-            failed = np.zeros(self.num_envs, bool)
-        except SimulationError:
-            failed = batch.status != 0
+        failed = np.zeros(self.num_envs, bool)
+        # What tows bodies moves before each physics step.
+        calls, per_call = (self.robot.substeps, 1) if self._towed else (1, self.robot.substeps)
+        for call in range(calls):
+            if self._towed:
+                self._tow()
+            last = call == calls - 1
+            try:
+                batch.step(nstep=per_call, stage=_ACCELERATION if last else _NOTHING)
+            except SimulationError:
+                failed |= batch.status != 0
         if self._warning.any():  # hardly ever: what follows is left out
             failed |= self._warning[:, _DIVERGED, 1].any(-1)
         for value in (self._qpos, self._qvel, self._qacc):
@@ -186,7 +244,7 @@ class RobotBatch:
     def _sense(self, rows: Rows | slice) -> Motion:
         # Copies: what a robot returns may be part of the live state.
         sensed = self.robot.sense(self._qpos[rows], self._qvel[rows], self._qacc[rows])
-        return Motion(*map(np.array, sensed))
+        return Motion(*map(np.array, sensed._replace(sensors=self._sensors[rows])))
 
     def _late(self, command: Array) -> Array:
         """The command [N, nu] that arrives when this one is sent."""
@@ -265,7 +323,8 @@ class Core:
         self.observation_size = task.observation_size(robot)
         self.randomization = randomization
         max_delay = None if randomization is None else randomization.actuator_delay[1]
-        self._robots = RobotBatch(robot, num_envs, num_threads, max_delay)
+        bodies = getattr(task, "bodies", None)
+        self._robots = RobotBatch(robot, num_envs, num_threads, max_delay, bodies)
         self._started = False
         self._objects: Objects = {
             name: np.zeros((num_envs, *value.shape[1:])) for name, value in objects.items()
@@ -306,7 +365,7 @@ class Core:
         position, yaw, objects = self.task.sample(self.robot, self._streams, rows)
         if self.randomization is not None:
             self._robots.vary(rows, self.randomization.sample(self._streams, rows))
-        self._robots.place(rows, position, yaw)
+        self._robots.place(rows, position, yaw, objects)
         self._objects = {
             name: _with_rows(old, rows, objects[name]) for name, old in self._objects.items()
         }
@@ -436,8 +495,10 @@ class Core:
         }
 
     def qpos(self, index: int) -> Array:
-        """A copy of the generalised position [nq] of one environment."""
-        return self._robots.batch.bind("qpos")[index].copy()
+        """A copy of the robot's generalised position [nq] in one environment."""
+        position = self._robots.motion.position[:1]
+        size = self.robot.place(position, position[:, 0]).shape[1]
+        return self._robots.batch.bind("qpos")[index, :size].copy()
 
     def scan(self, index: int) -> Array:
         """The lidar's readings [R] in one environment, without noise."""

@@ -9,13 +9,18 @@ from torchrl_safe.envs._random import RandomStreams
 from torchrl_safe.envs.robots import Array
 from torchrl_safe.envs.tasks.base import length
 
-_CANDIDATES = 32  # positions tried for one object before its layout is started again
-_ATTEMPTS = 200  # layouts started before giving up
+_ATTEMPTS = 2000  # layouts started before giving up
+_AT_ONCE = 16  # most attempts that are made at once for an environment
+_FIRST = 6  # candidates looked at first: mostly one of them will do
 _GOAL_CANDIDATES = 256  # positions tried for one that moves during an episode
 
 
 def scatter(
-    keepout: Array, extent: float, streams: RandomStreams, rows: NDArray[np.integer]
+    keepout: Array,
+    extent: float,
+    streams: RandomStreams,
+    rows: NDArray[np.integer],
+    candidates: int = 32,
 ) -> Array:
     """Draws positions whose keepout discs do not overlap.
 
@@ -28,6 +33,7 @@ def scatter(
         extent (float): half the side of the square.
         streams (RandomStreams): one stream per environment, advanced in place.
         rows (array): [n], the environments to draw for.
+        candidates (int): positions tried for one object before its layout is started again.
 
     Returns:
         array: [n, K, 2].
@@ -38,30 +44,55 @@ def scatter(
     count, half = len(keepout), extent - keepout
     if half.min() < 0.0:
         raise ValueError(f"a keepout of {keepout.max()} does not fit an extent of {extent}.")
-    gap = keepout[:, None] + keepout
-    # Positions are complex numbers here: a distance is one absolute value.
     layout = np.empty((len(rows), count), complex)
-    pending = np.arange(len(rows))
-    for _ in range(_ATTEMPTS):
-        draws = streams.uniform(rows[pending], count * _CANDIDATES * 2) * 2.0 - 1.0
-        candidates = draws.view(complex).reshape(-1, count, _CANDIDATES) * half[:, None]
-        placed = candidates[:, :, 0].copy()
-        legal = np.ones(len(pending), bool)
-        index = np.arange(len(pending))
-        for j in range(1, count):
-            distance = np.abs(candidates[:, j, :, None] - placed[:, None, :j])
-            free = (distance >= gap[j, :j]).all(-1)
-            first = free.argmax(-1)
-            legal &= free[index, first]
-            placed[:, j] = candidates[index, j, first]
-        layout[pending[legal]] = placed[legal]
-        pending = pending[~legal]
+    pending, made, at_once = np.arange(len(rows)), 0, 1
+    numbers = 2 * count * candidates  # of one attempt, whether it needs them or not
+    while made < _ATTEMPTS:
+        owner = np.repeat(pending, at_once)
+        attempt = np.tile(np.arange(at_once), len(pending))
+        placed, legal = _attempt(keepout, half, streams, rows[owner], attempt * numbers, candidates)
+        # The first legal attempt counts, as if each had waited for the one before it.
+        found, first = np.unique(owner[legal], return_index=True)
+        layout[found] = placed[legal[first]]
+        streams.skip(rows[found], (attempt[legal[first]] + 1) * numbers)
+        pending = np.setdiff1d(pending, found, assume_unique=True)
         if not pending.size:
             return layout.view(float).reshape(-1, count, 2)
+        streams.skip(rows[pending], at_once * numbers)
+        made, at_once = made + at_once, min(2 * at_once, _AT_ONCE)
     raise ValueError(
         f"no legal layout found in {_ATTEMPTS} attempts for {count} objects in an extent of "
         f"{extent}: use fewer hazards or other objects, smaller keepouts or a larger extent."
     )
+
+
+def _attempt(
+    keepout: Array,
+    half: Array,
+    streams: RandomStreams,
+    rows: NDArray[np.integer],
+    ahead: NDArray[np.integer],
+    candidates: int,
+) -> tuple[NDArray[np.complex128], NDArray[np.intp]]:
+    """Layouts [n, K] as complex numbers, of the numbers ``ahead`` [n], and which are legal."""
+    # A distance of complex numbers is one absolute value.
+    placed = np.empty((len(rows), len(keepout)), complex)
+    legal = np.arange(len(rows))
+    for j in range(len(keepout)):
+        nowhere = legal
+        for start, end in ((0, _FIRST), (_FIRST, candidates)):
+            skipped = ahead[nowhere] + 2 * (j * candidates + start)
+            draws = streams.peek(rows[nowhere], skipped, 2 * (end - start)) * 2.0 - 1.0
+            places = draws.view(complex) * half[j]
+            distance = np.abs(places[:, :, None] - placed[nowhere, None, :j])
+            free = (distance >= keepout[j] + keepout[:j]).all(-1)
+            found = free.any(-1)
+            placed[nowhere[found], j] = places[found, free[found].argmax(-1)]
+            nowhere = nowhere[~found]
+            if not nowhere.size:
+                break
+        legal = np.setdiff1d(legal, nowhere, assume_unique=True)
+    return placed, legal
 
 
 def place_goal(
@@ -88,10 +119,18 @@ def place_goal(
     Returns:
         array: [n, 2].
     """
-    draws = streams.uniform(rows, 2 * _GOAL_CANDIDATES).reshape(-1, _GOAL_CANDIDATES, 2)
-    candidates = (draws * 2.0 - 1.0) * (extent - keepout)
-    gaps = length(candidates[:, :, None] - others[:, None]) - other_keepouts
-    clearance = gaps.min(-1)
-    legal = clearance >= keepout
-    choice = np.where(legal.any(-1), legal.argmax(-1), clearance.argmax(-1))
-    return candidates[np.arange(len(rows)), choice]
+    goal = np.empty((len(rows), 2))
+    nowhere = np.arange(len(rows))
+    for count in (_FIRST, _GOAL_CANDIDATES):
+        draws = streams.peek(rows[nowhere], np.zeros(len(nowhere), np.int64), 2 * count)
+        places = (draws.reshape(-1, count, 2) * 2.0 - 1.0) * (extent - keepout)
+        gaps = length(places[:, :, None] - others[nowhere, None]) - other_keepouts
+        clearance = gaps.min(-1)
+        legal = clearance >= keepout
+        best = np.where(legal.any(-1), legal.argmax(-1), clearance.argmax(-1))
+        goal[nowhere] = places[np.arange(len(nowhere)), best]
+        nowhere = nowhere[~legal.any(-1)]
+        if not nowhere.size:
+            break
+    streams.skip(rows, 2 * _GOAL_CANDIDATES)
+    return goal

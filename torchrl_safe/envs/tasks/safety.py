@@ -30,6 +30,7 @@ from torchrl_safe.envs.tasks.bodies import Bodies, Body, Readings, own_size, rea
 from torchrl_safe.envs.tasks.layout import place_goal, scatter
 
 _REWARD_CLIP = 10.0
+_CANDIDATES = 100  # positions tried for an object; more would favour other layouts
 
 
 class Kind(NamedTuple):
@@ -92,7 +93,8 @@ class SafetyTask:
         """Draws robot position [n, 2] and objects."""
         kinds = self.kinds
         keepout = np.repeat([kind.keepout for kind in kinds], [kind.count for kind in kinds])
-        layout = scatter(np.append(robot.keepout, keepout), self.extent, streams, rows)
+        keepouts = np.append(robot.keepout, keepout)
+        layout = scatter(keepouts, self.extent, streams, rows, _CANDIDATES)
         objects, first = {}, 1
         for kind in kinds:
             objects[kind.name] = layout[:, first : first + kind.count]

@@ -102,7 +102,7 @@ def put(core: Core, name: str, state: dict[str, np.ndarray]) -> None:
         centre = np.insert(state["gremlins_centre"], 2, 0.0, axis=2)
         batch.bind("mocap_pos")[:, where] = centre + offset
     robots.perceive(np.arange(core.num_envs))
-    readings = read_sensors(core.robot, task.bodies, robots.motion.sensors)
+    readings = read_sensors(core.robot, task.bodies, robots.motion.proprioception)
     here = readings.position[:, :2]
     for kind, places in readings.positions.items():
         core._objects[kind] = places[..., :2].copy()
@@ -152,7 +152,7 @@ class TestEquality:
             want = steps(name, f"cost_{key}")
             want = np.where(np.isnan(want), 0, want)
             objects = before
-            r = read_sensors(core.robot, core.task.bodies, core._robots.motion.sensors)
+            r = read_sensors(core.robot, core.task.bodies, core._robots.motion.proprioception)
             got = core.task.costs(r, objects).get(key, np.zeros(len(want)))
             if (want != got).any():
                 print("cost", key, np.flatnonzero(want != got), want.sum(), got.sum())

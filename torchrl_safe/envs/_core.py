@@ -82,11 +82,10 @@ class RobotBatch:
         self._model = model = compile_model(robot, bodies)
         self._addresses = [state_addresses(model, body) for body in self.bodies]
         self._towed = any(body.hold == "towed" for body in self.bodies)
-        # The sensors that a robot's own file may have are not read.
-        self._num_sensors = 0 if bodies is None else model.nsensordata
-        plane, size = np.zeros((num_envs, 2)), len(robot.proprioception_scale)
-        readings = np.zeros((num_envs, self._num_sensors))
-        self.motion = Motion(plane, plane, np.zeros((num_envs, size)), readings)
+        self._has_sensors = bodies is not None
+        size = model.nsensordata if self._has_sensors else len(robot.proprioception_scale)
+        plane = np.zeros((num_envs, 2))
+        self.motion = Motion(plane, plane, np.zeros((num_envs, size)))
         if max_delay is not None:
             one, zero = np.ones(num_envs), np.zeros(num_envs)
             self.variation = Variation(one, one, one, zero, zero, zero)
@@ -112,7 +111,8 @@ class RobotBatch:
             self._time = batch.bind("time")
             self._ctrl, self._qacc = batch.bind("ctrl"), batch.bind("qacc")
             self._mocap_pos, self._mocap_quat = batch.bind("mocap_pos"), batch.bind("mocap_quat")
-            self._sensors = batch.bind("sensordata") if self._num_sensors else self.motion.sensors
+            if self._has_sensors:
+                self._sensors = batch.bind("sensordata")
             self._warning = batch.warning
             self._before = np.empty_like(batch.state)
             if self.variation is not None:
@@ -244,7 +244,9 @@ class RobotBatch:
     def _sense(self, rows: Rows | slice) -> Motion:
         # Copies: what a robot returns may be part of the live state.
         sensed = self.robot.sense(self._qpos[rows], self._qvel[rows], self._qacc[rows])
-        return Motion(*map(np.array, sensed._replace(sensors=self._sensors[rows])))
+        if self._has_sensors:
+            sensed = sensed._replace(proprioception=self._sensors[rows])
+        return Motion(*map(np.array, sensed))
 
     def _late(self, command: Array) -> Array:
         """The command [N, nu] that arrives when this one is sent."""

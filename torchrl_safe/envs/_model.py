@@ -15,7 +15,7 @@ _SHAPES = {
 }
 _SENSOR, _OBJECT = mujoco.mjtSensor, mujoco.mjtObj
 _TOW_SOLREF = (0.02, 1.5)
-_WELD = (0.0,) * 10 + (1.0,)  # as the two bodies are at the start; torques count as forces
+_WELD = (0.0,) * 10 + (1.0, 0.0)  # as the two bodies are at the start; torques count as forces
 
 
 def compile_model(robot: Robot, bodies: Bodies | None = None) -> mujoco.MjModel:

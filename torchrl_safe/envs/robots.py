@@ -33,15 +33,14 @@ class Motion(NamedTuple):
     Attributes:
         position (array): [N, 2], metres, world frame.
         heading (array): [N, 2], unit vector the robot faces, world frame.
-        proprioception (array): [N, P], what the robot senses of itself, in its own frame, unscaled.
-        sensors (array): [N, S], the sensors that a task with bodies adds to the model; see
+        proprioception (array): [N, P], what the robot senses of itself, in its own frame, unscaled;
+            in a task with bodies, all that its model's sensors read: see
             :func:`torchrl_safe.envs.tasks.bodies.read_sensors`.
     """
 
     position: Array
     heading: Array
     proprioception: Array
-    sensors: Array = np.empty((0, 0))
 
 
 @dataclass(frozen=True)

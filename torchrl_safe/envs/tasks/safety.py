@@ -153,10 +153,10 @@ class SafetyTask:
 
     def sense(self, robot: Robot, motion: Motion, objects: Objects) -> Sensed:
         """Lidars, but the goal's and the buttons' as :meth:`observe` shows them; and the cost."""
-        readings = read_sensors(robot, self.bodies, motion.sensors)
+        readings = read_sensors(robot, self.bodies, motion.proprioception)
         scan = np.concatenate(
             [self.lidar(readings, _places(readings, objects, kind.name)) for kind in self.kinds]
-            or [np.zeros((len(motion.sensors), 0))],
+            or [np.zeros((len(motion.proprioception), 0))],
             1,
         )
         none = np.zeros(len(scan), bool)
@@ -175,7 +175,7 @@ class SafetyTask:
         streams: RandomStreams,
     ) -> Outcome:
         """The reward of the step; a reached goal moves."""
-        readings = read_sensors(robot, self.bodies, motion.sensors)
+        readings = read_sensors(robot, self.bodies, motion.proprioception)
         moved = {name: np.array(place[..., :2]) for name, place in readings.positions.items()}
         objects, reward, goal_met = self.judge(readings, objects | moved, streams, robot)
         clip = self.reward_clip
@@ -192,7 +192,7 @@ class SafetyTask:
         self, robot: Robot, motion: Motion, objects: Objects, scan: Array
     ) -> NDArray[np.float32]:
         """Sensors and lidars, unscaled."""
-        readings = read_sensors(robot, self.bodies, motion.sensors)
+        readings = read_sensors(robot, self.bodies, motion.proprioception)
         out = np.concatenate((readings.own, scan), 1, dtype=np.float32)
         first, bins = readings.own.shape[1], self.lidar_bins
         for number, kind in enumerate(self.kinds):

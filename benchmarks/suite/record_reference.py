@@ -18,8 +18,11 @@ import safety_gymnasium
 TASKS = ("Goal0", "Goal1", "Goal2", "Circle0", "Circle1", "Circle2", "Run0")
 TASKS += ("Button0", "Button1", "Button2", "Push0", "Push1", "Push2")
 ROBOTS = ("Point", "Car")
-STEPS = 25
-LAYOUTS = 200  # of which only the positions are kept, for the statistics
+STEPS = 20
+LAYOUTS = {
+    "Button1": 60,
+    "Button2": 40,
+}  # 200 of other tasks, of which only the positions are kept, for the statistics
 COSTS = ("hazards", "vases_contact", "vases_velocity", "pillars", "gremlins", "buttons")
 COSTS += ("out_of_boundary",)
 # Objects that move are found in the simulation, others in the layout.
@@ -146,10 +149,10 @@ def record(name, seed):
             goal = task.data.body(body).xpos[:2].copy() if body else None
             if kind == "sigwalls":
                 start = np.array([task.sigwalls.locate_factor - 0.15, task.agent.pos[1] * 0.9])
-                goal = start + [1.0, 0.0]
+                goal = start + np.array([1.0, 0.0])
             else:
                 angle = rng.uniform(0.0, 2.0 * np.pi)
-                start = goal + (0.45 if kind != "push_box" else 0.6) * turn(angle)[0]
+                start = goal + (0.42 if kind != "push_box" else 0.6) * turn(angle)[0]
             x, y = goal - start
             # Not straight ahead: for an angle just below zero their lidar has no bin.
             yaw = 0.05 + np.arctan2(y, x) + (0.0 if task.agent_name == "Point" else np.pi / 2.0)
@@ -157,10 +160,9 @@ def record(name, seed):
         states, steps = [state(task)], []
         observations = [task.obs().astype(np.float32)]
         for _ in range(STEPS):
-            if target is None:
-                action = rng.uniform(-1.0, 1.0, 2)
-            else:
-                action = steer(task, rng, goal)
+            if target is not None and target[0]:
+                goal = task.data.body(target[0]).xpos[:2].copy()
+            action = rng.uniform(-1.0, 1.0, 2) if target is None else steer(task, rng, goal)
             observation, reward, cost, _, _, info = env.step(action)
             observations.append(observation.astype(np.float32))
             states.append(state(task))
@@ -199,14 +201,17 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("folder", type=Path)
     parser.add_argument("--tasks", nargs="*", default=TASKS)
+    parser.add_argument("--robots", nargs="*", default=ROBOTS)
     args = parser.parse_args()
     args.folder.mkdir(parents=True, exist_ok=True)
-    for robot in ROBOTS:
+    for robot in args.robots:
         for task in args.tasks:
             name = f"Safety{robot}{task}"
             rows = record(f"{name}-v0", seed=7)
             if robot == "Point":
-                rows["layouts"], rows["layout_names"] = layouts(f"{name}-v0", LAYOUTS)
+                rows["layouts"], rows["layout_names"] = layouts(
+                    f"{name}-v0", LAYOUTS.get(task, 200)
+                )
             path = args.folder / f"{name}.npz"
             np.savez_compressed(path, **rows)
             events = {

@@ -5,12 +5,16 @@ from __future__ import annotations
 import gymnasium
 
 from torchrl_safe.envs.robots import ROBOTS
+from torchrl_safe.envs.tasks import SAFETY_TASKS
 
 __all__ = ["register_envs"]
 
 
 def register_envs() -> None:
     """Registers an id for each robot with Gymnasium: ``torchrl_safe/<Robot>Goal-v0``.
+
+    And one for each of Safety-Gymnasium's tasks, by its name there:
+    ``torchrl_safe/SafetyPointGoal1-v0``.
 
     The robot's name in camel case: ``torchrl_safe/DoggoTorquesGoal-v0`` is ``"doggo_torques"``. The
     registry has no ``max_episode_steps``, as Gymnasium would cut a longer ``episode_length`` short
@@ -22,4 +26,11 @@ def register_envs() -> None:
             entry_point="torchrl_safe.envs.gymnasium:GymGoalEnv",
             vector_entry_point="torchrl_safe.envs.gymnasium:GymGoalVectorEnv",
             kwargs={"robot": name},
+        )
+    for name, (robot, task) in SAFETY_TASKS.items():
+        gymnasium.register(
+            f"torchrl_safe/{name}-v0",
+            entry_point="torchrl_safe.envs.gymnasium:GymGoalEnv",
+            vector_entry_point="torchrl_safe.envs.gymnasium:GymGoalVectorEnv",
+            kwargs={"robot": robot, "task": task, "episode_length": task.episode_length},
         )

@@ -42,6 +42,8 @@ def compile_model(robot: Robot, bodies: Bodies | None = None) -> mujoco.MjModel:
     if bodies:
         disable = mujoco.mjtDisableBit
         spec.option.disableflags &= ~int(disable.mjDSBL_CONTACT | disable.mjDSBL_CONSTRAINT)
+        # Convex shapes touch where they do in the MuJoCo that the tasks come from.
+        spec.option.disableflags |= int(disable.mjDSBL_MULTICCD | disable.mjDSBL_NATIVECCD)
         world, plane = spec.worldbody, mujoco.mjtGeom.mjGEOM_PLANE
         if all(geom.type != plane for geom in world.geoms):
             world.add_geom(type=plane, size=(50.0, 50.0, 0.1), condim=6, group=3)

@@ -57,17 +57,12 @@ __all__ = [
 
 
 def __getattr__(name: str) -> Any:
-    if name == "SafeGoalEnv":
-        from torchrl_safe.envs import goal as module
-    elif name in ("GymGoalEnv", "GymGoalVectorEnv"):
-        from torchrl_safe.envs import gymnasium as module
-    elif name == "SafeVelocityEnv":
-        from torchrl_safe.envs import velocity as module
-    elif name in ("GymVelocityEnv", "GymVelocityVectorEnv"):
-        from torchrl_safe.envs import velocity_gymnasium as module
-    else:
+    if name not in __all__:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(module, name)
+    from torchrl_safe.envs import goal, gymnasium, velocity, velocity_gymnasium
+
+    modules = (goal, gymnasium, velocity, velocity_gymnasium)
+    return getattr(next(module for module in modules if name in module.__all__), name)
 
 
 def __dir__() -> list[str]:

@@ -1,14 +1,15 @@
 """The simulator behind every face of the environments: numpy in, numpy out, N at a time.
 
 This is the only file that touches MuJoCo's thread pool. It moves robots and keeps episodes; what
-is around the robots belongs to the task, as arrays and not as bodies in the physics model.
+is around the robots belongs to the task: arrays, which for a task with bodies say where in the
+physics model these start.
 """
 
 from __future__ import annotations
 
 import os
 import weakref
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from typing import Any, NamedTuple
 
 import mujoco
@@ -16,6 +17,7 @@ import numpy as np
 from mujoco.batch import Batch, SimulationError
 from numpy.typing import NDArray
 
+from torchrl_safe.envs._model import compile_model, pose, state_addresses
 from torchrl_safe.envs._process import keep_forever
 from torchrl_safe.envs._random import RandomStreams
 from torchrl_safe.envs.randomization import (
@@ -26,6 +28,7 @@ from torchrl_safe.envs.randomization import (
 )
 from torchrl_safe.envs.robots import Array, Motion, Robot, get_robot
 from torchrl_safe.envs.tasks import TASKS, Objects, Task
+from torchrl_safe.envs.tasks.bodies import Bodies
 
 Rows = NDArray[np.integer]
 Mask = NDArray[np.bool_]
@@ -121,8 +124,23 @@ class SimulationPool:
         """The live state, [N, S]: writing it is setting the simulations."""
         return self.batch.state
 
-    def advance(self, ctrl: Array, substeps: int, stage: int = _NOTHING) -> Mask:
+    def advance(
+        self,
+        ctrl: Array,
+        substeps: int,
+        stage: int = _NOTHING,
+        *,
+        before_each: Callable[[], None] | None = None,
+    ) -> Mask:
         """Makes some physics steps under the controls [N, nu], then evaluates a stage.
+
+        Args:
+            ctrl (array): [N, nu].
+            substeps (int): how many.
+            stage (int): what is evaluated at the state that they led to.
+
+        Keyword Args:
+            before_each (callable, optional): what else is set before each of the steps.
 
         Returns:
             array: [N], the simulations that diverged; they are put back where they were.
@@ -130,11 +148,15 @@ class SimulationPool:
         batch = self.batch
         np.copyto(self._before, batch.state)
         self._ctrl[:] = ctrl
-        try:
-            batch.step(nstep=substeps, stage=stage)
-            failed = np.zeros(self.num_envs, bool)
-        except SimulationError:
-            failed = batch.status != 0
+        failed = np.zeros(self.num_envs, bool)
+        calls, per_call = (1, substeps) if before_each is None else (substeps, 1)
+        for call in range(calls):
+            if before_each is not None:
+                before_each()
+            try:
+                batch.step(nstep=per_call, stage=stage if call == calls - 1 else _NOTHING)
+            except SimulationError:
+                failed |= batch.status != 0
         if self._warning.any():  # hardly ever: what follows is left out
             failed |= self._warning[:, _DIVERGED, 1].any(-1)
         for value in (self._qpos, self._qvel, self._qacc):
@@ -168,6 +190,7 @@ class RobotBatch(SimulationPool):
         num_threads (int): threads that step them, this one included.
         max_delay (int, optional): most environment steps a command can be late by. ``None`` for
             robots that are all as their model, which is cheaper.
+        bodies (tuple of Body, optional): what is around them in the physics model.
 
     Attributes:
         motion (Motion): where the robots are and what they sense. Accelerations are evaluated once
@@ -176,17 +199,26 @@ class RobotBatch(SimulationPool):
         commands (array or None): [N, max_delay + 1, nu], the last ones, newest first.
     """
 
-    _bound = (*SimulationPool._bound, "_time")
+    _bound = (*SimulationPool._bound, "_time", "_mocap_pos", "_mocap_quat", "_sensors")
 
     def __init__(
-        self, robot: Robot, num_envs: int, num_threads: int, max_delay: int | None = None
+        self,
+        robot: Robot,
+        num_envs: int,
+        num_threads: int,
+        max_delay: int | None = None,
+        bodies: Bodies | None = None,
     ) -> None:
-        model = mujoco.MjModel.from_xml_path(str(robot.asset_path))
-        model.opt.timestep = robot.timestep
+        model = compile_model(robot, bodies)
         super().__init__(model, num_envs, num_threads)
         self.robot = robot
+        self.bodies = bodies or ()
+        self._addresses = [state_addresses(model, body) for body in self.bodies]
+        self._towed = any(body.hold == "towed" for body in self.bodies)
+        self._has_sensors = bodies is not None
+        size = model.nsensordata if self._has_sensors else len(robot.proprioception_scale)
         plane = np.zeros((num_envs, 2))
-        self.motion = Motion(plane, plane, np.zeros((num_envs, len(robot.proprioception_scale))))
+        self.motion = Motion(plane, plane, np.zeros((num_envs, size)))
         self.variation: Variation | None = None
         self.commands: Array | None = None
         if max_delay is not None:
@@ -197,6 +229,9 @@ class RobotBatch(SimulationPool):
     def _bind(self, batch: Batch) -> None:
         super()._bind(batch)
         self._time = batch.bind("time")
+        self._mocap_pos, self._mocap_quat = batch.bind("mocap_pos"), batch.bind("mocap_quat")
+        if self._has_sensors:
+            self._sensors = batch.bind("sensordata")
         if self.variation is not None:
             self.vary(np.arange(self.num_envs), self.variation)
 
@@ -214,14 +249,48 @@ class RobotBatch(SimulationPool):
         batch.expand("actuator_gainprm")[rows] = model.actuator_gainprm * gain[..., None]
         batch.set_const(rows)
 
-    def place(self, rows: Rows, position: Array, yaw: Array) -> None:
-        """Puts the robots ``rows`` at rest at position [n, 2] and yaw [n]."""
+    def place(
+        self, rows: Rows, position: Array, yaw: Array, objects: Objects | None = None
+    ) -> None:
+        """Puts the robots ``rows`` at rest at position [n, 2] and yaw [n], and bodies around."""
         batch = self.batch
         batch.state[rows] = self._initial
-        self._qpos[rows] = self.robot.place(position, yaw)
+        qpos = self.robot.place(position, yaw)
+        self._qpos[rows, : qpos.shape[1]] = qpos
+        self._place_bodies(rows, objects or {})
         if self.commands is not None:
             self.commands = _with_rows(self.commands, rows, np.zeros(1))
         self.perceive(rows)
+
+    def _place_bodies(self, rows: Rows, objects: Objects) -> None:
+        """At rest at ``objects[name]`` [n, K, 2], turned by ``objects[name + "_yaw"]`` [n, K]."""
+        column = rows[:, None]
+        for body, where in zip(self.bodies, self._addresses, strict=True):
+            xyz, quaternion = pose(body, objects[body.name], objects.get(f"{body.name}_yaw"))
+            if "qpos" in where:
+                index = where["qpos"][:, None] + np.arange(7)
+                self._qpos[rows[:, None, None], index] = np.concatenate((xyz, quaternion), -1)
+            if "anchor" in where:
+                xyz[..., 2] = 0.0
+                self._mocap_pos[column, where["anchor"]] = xyz
+            if "mocap" in where:
+                self._mocap_pos[column, where["mocap"]] = xyz
+                self._mocap_quat[column, where["mocap"]] = quaternion
+
+    def _tow(self) -> None:
+        """Moves what tows bodies to where it is at this time."""
+        time = self._time[:, None]
+        for body, where in zip(self.bodies, self._addresses, strict=True):
+            if body.hold == "towed":
+                offset = np.stack(
+                    (
+                        body.travel * np.sin(time),
+                        body.travel * np.cos(time),
+                        np.full_like(time, body.lift),
+                    ),
+                    -1,
+                )
+                self._mocap_pos[:, where["mocap"]] = self._mocap_pos[:, where["anchor"]] + offset
 
     def perceive(self, rows: Rows) -> None:
         """Evaluates what the robots ``rows`` sense where they are now."""
@@ -237,7 +306,10 @@ class RobotBatch(SimulationPool):
         """
         _ = self.batch  # builds the pool, whose arrays are read
         command = self.robot.control(action, self._qpos, self._qvel, self._time)
-        failed = self.advance(self._late(command), self.robot.substeps, _ACCELERATION)
+        before_each = self._tow if self._towed else None
+        failed = self.advance(
+            self._late(command), self.robot.substeps, _ACCELERATION, before_each=before_each
+        )
         sensed = self._sense(slice(None))
         if failed.any():
             pairs = zip(sensed, self.motion, strict=True)
@@ -248,6 +320,8 @@ class RobotBatch(SimulationPool):
     def _sense(self, rows: Rows | slice) -> Motion:
         # Copies: what a robot returns may be part of the live state.
         sensed = self.robot.sense(self._qpos[rows], self._qvel[rows], self._qacc[rows])
+        if self._has_sensors:
+            sensed = sensed._replace(proprioception=self._sensors[rows])
         return Motion(*map(np.array, sensed))
 
     def _late(self, command: Array) -> Array:
@@ -308,7 +382,8 @@ class Core:
         self.observation_size = task.observation_size(robot)
         self.randomization = randomization
         max_delay = None if randomization is None else randomization.actuator_delay[1]
-        self._robots = RobotBatch(robot, num_envs, num_threads, max_delay)
+        bodies = getattr(task, "bodies", None)
+        self._robots = RobotBatch(robot, num_envs, num_threads, max_delay, bodies)
         self._started = False
         self._objects: Objects = {
             name: np.zeros((num_envs, *value.shape[1:])) for name, value in objects.items()
@@ -349,7 +424,7 @@ class Core:
         position, yaw, objects = self.task.sample(self.robot, self._streams, rows)
         if self.randomization is not None:
             self._robots.vary(rows, self.randomization.sample(self._streams, rows))
-        self._robots.place(rows, position, yaw)
+        self._robots.place(rows, position, yaw, objects)
         self._objects = {
             name: _with_rows(old, rows, objects[name]) for name, old in self._objects.items()
         }
@@ -473,8 +548,10 @@ class Core:
         }
 
     def qpos(self, index: int) -> Array:
-        """A copy of the generalised position [nq] of one environment."""
-        return self._robots.batch.bind("qpos")[index].copy()
+        """A copy of the robot's generalised position [nq] in one environment."""
+        position = self._robots.motion.position[:1]
+        size = self.robot.place(position, position[:, 0]).shape[1]
+        return self._robots.batch.bind("qpos")[index, :size].copy()
 
     def scan(self, index: int) -> Array:
         """The lidar's readings [R] in one environment, without noise."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import gymnasium
 
 from torchrl_safe.envs.robots import ROBOTS
+from torchrl_safe.envs.tasks import SAFETY_TASKS
 from torchrl_safe.envs.tasks.velocity import VELOCITY_TASKS
 
 __all__ = ["register_envs"]
@@ -15,9 +16,9 @@ def register_envs() -> None:
 
     ``torchrl_safe/<Robot>Goal-v0``, the robot's name in camel case:
     ``torchrl_safe/DoggoTorquesGoal-v0`` is ``"doggo_torques"``; and
-    ``torchrl_safe/Safety<Robot>Velocity-v1``, by Safety-Gymnasium's names. The registry has no
-    ``max_episode_steps``, as Gymnasium would cut a longer ``episode_length`` short by it; the
-    ``spec`` of an environment has.
+    ``torchrl_safe/SafetyPointGoal1-v0``, ``torchrl_safe/SafetyAntVelocity-v1`` and the like, by
+    Safety-Gymnasium's names. The registry has no ``max_episode_steps``, as Gymnasium would cut a
+    longer ``episode_length`` short by it; the ``spec`` of an environment has.
     """
     for name in ROBOTS:
         gymnasium.register(
@@ -26,10 +27,17 @@ def register_envs() -> None:
             vector_entry_point="torchrl_safe.envs.gymnasium:GymGoalVectorEnv",
             kwargs={"robot": name},
         )
-    for task in VELOCITY_TASKS.values():
+    for velocity in VELOCITY_TASKS.values():
         gymnasium.register(
-            f"torchrl_safe/Safety{task.title}Velocity-v1",
+            f"torchrl_safe/Safety{velocity.title}Velocity-v1",
             entry_point="torchrl_safe.envs.velocity_gymnasium:GymVelocityEnv",
             vector_entry_point="torchrl_safe.envs.velocity_gymnasium:GymVelocityVectorEnv",
-            kwargs={"task": task.name},
+            kwargs={"task": velocity.name},
+        )
+    for name, (robot, task) in SAFETY_TASKS.items():
+        gymnasium.register(
+            f"torchrl_safe/{name}-v0",
+            entry_point="torchrl_safe.envs.gymnasium:GymGoalEnv",
+            vector_entry_point="torchrl_safe.envs.gymnasium:GymGoalVectorEnv",
+            kwargs={"robot": robot, "task": task, "episode_length": task.episode_length},
         )

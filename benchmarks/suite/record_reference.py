@@ -86,7 +86,7 @@ def state(task):
         bodies = names(task, kind, pattern)
         if bodies:
             out[f"{kind}_qpos"] = np.array([data.joint(name).qpos for name in bodies])
-            out[f"{kind}_qvel"] = np.array([data.joint(name).qvel for name in bodies])
+            out[f"{kind}_qvel"] = np.array([data.joint(name).qvel for name in bodies], np.float32)
     for kind, pattern in FIXED:
         bodies = names(task, kind, pattern)
         if bodies:
@@ -152,7 +152,10 @@ def record(name, seed):
                 goal = start + np.array([1.0, 0.0])
             else:
                 angle = rng.uniform(0.0, 2.0 * np.pi)
-                start = goal + (0.42 if kind != "push_box" else 0.6) * turn(angle)[0]
+                if kind == "gremlins":  # there it will be, and near
+                    goal += [0.0, task.gremlins.travel]
+                near = {"gremlins": 0.26, "push_box": 0.6}.get(kind, 0.42)
+                start = goal + near * turn(angle)[0]
             x, y = goal - start
             # Not straight ahead: for an angle just below zero their lidar has no bin.
             yaw = 0.05 + np.arctan2(y, x) + (0.0 if task.agent_name == "Point" else np.pi / 2.0)

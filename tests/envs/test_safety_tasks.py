@@ -23,7 +23,7 @@ from torchrl_safe.envs.tasks.bodies import own_size, read_sensors
 SOURCES = ("hazards", "vases_contact", "vases_velocity", "pillars", "gremlins", "buttons")
 SOURCES += ("out_of_boundary",)
 REFERENCE = Path(__file__).parent / "reference"
-NAMES = sorted(path.stem for path in REFERENCE.glob("*.npz"))
+NAMES = sorted(path.stem for path in REFERENCE.glob("Safety*.npz"))
 
 
 @cache

@@ -90,11 +90,11 @@ def _add_body(spec: mujoco.MjSpec, body: Body, index: int) -> None:
     added = world.add_body(name=name, pos=(0.0, 0.0, body.height), mocap=fixed)
     if not fixed:
         added.add_joint(name=name, type=mujoco.mjtJoint.mjJNT_FREE, damping=0.0)
-    parts = ((_SHAPES[body.shape], body.size, (0.0, 0.0, 0.0)),)
-    parts += tuple((_SHAPES["box"], size, centre) for size, centre in body.knobs)
+    parts = [(_SHAPES[body.shape], body.size, (0.0, 0.0, 0.0))]
+    parts += [(_SHAPES["box"], size, centre) for size, centre in body.knobs]
     for shape, size, centre in parts:
-        size = (*size, 0.0, 0.0)[:3]
-        added.add_geom(type=shape, size=size, pos=centre, density=body.density, condim=6)
+        padded = (*size, 0.0, 0.0)[:3]
+        added.add_geom(type=shape, size=padded, pos=centre, density=body.density, condim=6)
     if body.hold == "towed":
         for key in ("mocap", "anchor"):
             world.add_body(name=f"{key}/{name}", mocap=True)

@@ -8,16 +8,20 @@ its objects of the same names: positions ``objects["vases"]`` [N, K, 2] and, if 
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from torchrl_safe.envs.robots import Array, Robot
 
 Shape = Literal["box", "cylinder", "sphere"]
+Mask = NDArray[np.bool_]
 
 
-class Body(NamedTuple):
+@dataclass(frozen=True)
+class Body:
     """Some bodies that are alike.
 
     Attributes:
@@ -75,7 +79,7 @@ class Readings(NamedTuple):
     x_axis: Array
     y_axis: Array
     velocity: Array
-    touched: dict[str, Array]
+    touched: dict[str, Mask]
     positions: dict[str, Array]
     velocities: dict[str, Array]
 
@@ -110,7 +114,9 @@ def read_sensors(robot: Robot, bodies: Bodies, sensors: Array) -> Readings:
         own = np.concatenate((own, *turning, *matrices), 1)
     frame = sensors[:, start : start + 12].reshape(num_envs, 4, 3)
     start += 12
-    touched, positions, velocities = {}, {}, {}
+    touched: dict[str, Mask] = {}
+    positions: dict[str, Array] = {}
+    velocities: dict[str, Array] = {}
     for body in bodies:
         touched[body.name] = sensors[:, start : start + body.count] > 0.0
         start += body.count
@@ -120,7 +126,8 @@ def read_sensors(robot: Robot, bodies: Bodies, sensors: Array) -> Readings:
                 end = start + 3 * body.count
                 found[body.name] = sensors[:, start:end].reshape(num_envs, body.count, 3)
                 start = end
-    return Readings(own, *frame.transpose(1, 0, 2), touched, positions, velocities)
+    one, two, three, four = frame.transpose(1, 0, 2)
+    return Readings(own, one, two, three, four, touched, positions, velocities)
 
 
 def _rotation(quaternion: Array) -> Array:

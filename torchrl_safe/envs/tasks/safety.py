@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import ClassVar, NamedTuple
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,7 +33,8 @@ _REWARD_CLIP = 10.0
 _CANDIDATES = 100  # positions tried for an object; more would favour other layouts
 
 
-class Kind(NamedTuple):
+@dataclass(frozen=True)
+class Kind:
     """A kind of object in a layout.
 
     Attributes:
@@ -131,8 +132,8 @@ class SafetyTask:
         """A beam through the middle of each bin in which some lidar reads something."""
         nearest = scan.reshape(-1, self.lidar_bins).max(0, initial=0.0)
         hit = np.flatnonzero(nearest > 0.0)
-        turn = 2.0 * np.pi / self.lidar_bins
-        return turn * (hit + 0.5), (1.0 - nearest[hit]) * self.lidar_range
+        turn: Array = 2.0 * np.pi / self.lidar_bins * (hit + np.float64(0.5))
+        return turn, (1.0 - nearest[hit]) * self.lidar_range
 
     def observation_size(self, robot: Robot) -> int:
         """The robot's sensors and a lidar per kind of object."""
@@ -249,7 +250,7 @@ def _places(readings: Readings, objects: Mapping[str, Array], name: str) -> Arra
 def inside(readings: Readings, places: Array, radius: float) -> Mask:
     """Whether the robot is inside one of the discs at [N, K, 2]."""
     distance = length(places - readings.position[:, None, :2])
-    return (distance < radius).any(-1)
+    return np.any(distance < radius, axis=-1)
 
 
 def goal_kind(keepout: float, radius: float = 0.3) -> Kind:

@@ -80,9 +80,9 @@ class SafetyButtonTask(SafetyTask):
             return {}
         pressed = readings.touched["buttons"] & ~_right(objects)
         return {
-            "buttons": pressed.any(-1) & (objects["timer"] == 0.0),
+            "buttons": np.any(pressed, axis=-1) & (objects["timer"] == 0.0),
             "hazards": inside(readings, objects["hazards"], _HAZARD_RADIUS),
-            "gremlins": readings.touched["gremlins"].any(-1),
+            "gremlins": np.any(readings.touched["gremlins"], axis=-1),
         }
 
     def judge(
@@ -91,7 +91,7 @@ class SafetyButtonTask(SafetyTask):
         """Progress to the right button, and one for pressing it."""
         position, goal = readings.position[:, :2], objects["goal"]
         distance = length(goal[:, 0] - position)
-        goal_met = (readings.touched["buttons"] & _right(objects)).any(-1)
+        goal_met: Mask = np.any(readings.touched["buttons"] & _right(objects), axis=-1)
         reward = objects["goal_distance"] - distance + goal_met
         timer = np.maximum(objects["timer"] - 1.0, 0.0)
         button = objects["goal_button"].copy()

@@ -70,7 +70,7 @@ class SafetyCircleTask(SafetyTask):
         if self.level == 0:
             return {}
         axes = 1 if self.level == 1 else 2
-        return {"out_of_boundary": (np.abs(readings.position[:, :axes]) > _WALLS).any(-1)}
+        return {"out_of_boundary": np.any(np.abs(readings.position[:, :axes]) > _WALLS, axis=-1)}
 
     def judge(
         self, readings: Readings, objects: Objects, streams: RandomStreams, robot: Robot

@@ -77,7 +77,7 @@ class SafetyGoalTask(SafetyTask):
         due = {"hazards": inside(readings, objects["hazards"], _HAZARD_RADIUS)}
         if self.level == 2:
             speed = np.linalg.norm(readings.velocities["vases"], axis=-1)
-            due["vases_contact"] = readings.touched["vases"].any(-1)
+            due["vases_contact"] = np.any(readings.touched["vases"], axis=-1)
             due["vases_velocity"] = (speed >= _SLOWEST).any(-1)
         return due
 

@@ -95,7 +95,7 @@ class SafetyPushTask(SafetyTask):
             return {}
         due = {"hazards": inside(readings, objects["hazards"], _HAZARD_RADIUS)}
         if self.level == 2:
-            due["pillars"] = readings.touched["pillars"].any(-1)
+            due["pillars"] = np.any(readings.touched["pillars"], axis=-1)
         return due
 
     def judge(

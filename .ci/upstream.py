@@ -21,7 +21,13 @@ ESTIMATES = [
     "tree_backup_lambda_return_estimate",
     "q_lambda_return_estimate",
 ]
-SAFETAC_ONLY = {"retrace_variance_reward", "squared_td_error", "_one_step_cost"}
+SAFETAC_ONLY = {
+    "retrace_variance_reward",
+    "squared_td_error",
+    "visited_value_estimate",
+    "_one_step_cost",
+    "_shift",
+}
 MAIN = """
 
 if __name__ == "__main__":
@@ -30,12 +36,14 @@ if __name__ == "__main__":
 
 
 def definitions(path: str, without: set[str] = frozenset()) -> str:
-    """Functions and classes of a file of ours, in order."""
+    """Functions, classes and private constants of a file of ours, in order."""
     text = (HERE / path).read_text()
     lines = text.splitlines()
     parts = []
     for node in ast.parse(text).body:
-        if isinstance(node, (ast.FunctionDef, ast.ClassDef)) and node.name not in without:
+        if isinstance(node, ast.Assign) and ast.unparse(node.targets[0]).startswith("_M"):
+            parts.append("\n".join(lines[node.lineno - 1 : node.end_lineno]))
+        elif isinstance(node, (ast.FunctionDef, ast.ClassDef)) and node.name not in without:
             first = min([node.lineno, *(line.lineno for line in node.decorator_list)])
             parts.append("\n".join(lines[first - 1 : node.end_lineno]))
     return "\n\n" + "\n\n\n".join(parts) + "\n"
@@ -85,7 +93,8 @@ def main(root: Path) -> None:
     text = insert(
         text,
         "import torch",
-        "from types import SimpleNamespace\nfrom typing import Any, Literal, TYPE_CHECKING\n\n",
+        "from collections.abc import Sequence\nfrom types import SimpleNamespace\n"
+        "from typing import Any, Literal, TYPE_CHECKING\n\n",
     )
     text = text.replace(
         "from contextlib import nullcontext",
@@ -99,7 +108,8 @@ def main(root: Path) -> None:
     text = insert(
         text,
         "from torchrl.envs.utils import",
-        "from torchrl.data.tensor_specs import Categorical, OneHot, TensorSpec\n",
+        "from tensordict.utils import unravel_key\n\n"
+        "from torchrl.data.tensor_specs import Bounded, Categorical, OneHot, TensorSpec\n",
     )
     text = insert(text, "td0_return_estimate,", "    retrace_lambda_return_estimate,\n")
     text = insert(
@@ -107,8 +117,9 @@ def main(root: Path) -> None:
         "def _standardize_by_group(",
         "if TYPE_CHECKING:\n    from torchrl.objectives.common import LossModule\n\n\n",
     )
-    files[value / "advantages.py"] = text + upstream(
-        definitions("torchrl_safe/objectives/value/advantages.py")
+    ours = ("utils", "advantages")
+    files[value / "advantages.py"] = text + "".join(
+        upstream(definitions(f"torchrl_safe/objectives/value/{name}.py")) for name in ours
     )
 
     text = (value / "__init__.py").read_text()

@@ -1,6 +1,7 @@
 """Random actions for a long time: finite, without a warning from MuJoCo, in the same memory.
 
-``python benchmarks/soak.py jackal --steps 1000000``; ``--randomized`` draws every robot anew.
+``python benchmarks/soak.py jackal --steps 1000000``, or a velocity task such as ``ant``;
+``--randomized`` draws every robot of ours anew.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ import time
 import numpy as np
 import torch
 
-from torchrl_safe.envs import JACKAL_TRAINING, SafeGoalEnv
+from torchrl_safe.envs import JACKAL_TRAINING, VELOCITY_TASKS, SafeGoalEnv, SafeVelocityEnv
 
 NUM_ENVS = 64
 
@@ -30,11 +31,15 @@ def main() -> None:
     args = parser.parse_args()
     torch.set_num_threads(1)
     randomization = JACKAL_TRAINING if args.randomized else None
-    env = SafeGoalEnv(args.robot, num_envs=NUM_ENVS, stagger=True, randomization=randomization)
+    if args.robot in VELOCITY_TASKS:
+        env = SafeVelocityEnv(args.robot, num_envs=NUM_ENVS, stagger=True)
+    else:
+        env = SafeGoalEnv(args.robot, num_envs=NUM_ENVS, stagger=True, randomization=randomization)
     td, generator = env.reset(), torch.Generator().manual_seed(0)
     warnings = env._core._robots.batch.warning
     rounds = max(args.steps // NUM_ENVS, 10)
-    counts = dict.fromkeys(("terminated", "truncated", "goal_met", "violation"), 0)
+    events = ("terminated", "truncated", "goal_met", "violation")
+    counts = {name: 0 for name in events if name in td.keys()}
     warned, memory, start = 0, [], time.perf_counter()
     shape = (NUM_ENVS, env.action_spec.shape[-1])
     held = torch.zeros(shape)

@@ -43,7 +43,10 @@ class TestRegistration:
     def test_ids(self):
         robots = ("Point", "Car", "Doggo", "DoggoTorques", "Jackal")
         registered = {name for name in gymnasium.registry if name.startswith("torchrl_safe/")}
-        assert registered == {f"torchrl_safe/{robot}Goal-v0" for robot in robots}
+        goals = {name for name in registered if name.endswith("Goal-v0")}
+        assert goals == {f"torchrl_safe/{robot}Goal-v0" for robot in robots}
+        robots = ("HalfCheetah", "Hopper", "Walker2d", "Ant", "Humanoid", "Swimmer")
+        assert registered >= {f"torchrl_safe/Safety{robot}Velocity-v1" for robot in robots}
 
     def test_without_an_import(self):
         env = gymnasium.make(f"torchrl_safe.envs:{POINT}")

@@ -151,7 +151,7 @@ FILES = {
     "keyframes": ("</mujoco>", '<keyframe><key name="rest" qpos="1 1 1"/></keyframe></mujoco>'),
     "what is not seen": ("<option>", '<compiler discardvisual="true"/><option>'),
     "defaults": (
-        '<geom density="1"',
+        '<geom condim="6" density="1"',
         '<material rgba="1 0 0 1"/><geom group="4" density="1"',
     ),
 }

@@ -56,7 +56,9 @@ from torchrl_safe.modules import (
 from torchrl_safe.objectives import (
     CVaRSurrogateLoss,
     LagrangeMultiplier,
+    LimitController,
     PIDMultiplier,
+    QuantileCostLoss,
     ReturnSurrogateLoss,
     lagrangian,
     value,
@@ -156,12 +158,17 @@ def make_cvar(**options: Any) -> CVaRCostLoss:
     return CVaRCostLoss(policy(), *networks, **{"cost_limit": 1.0, **options})
 
 
+def make_quantile(**options: Any) -> QuantileCostLoss:
+    return QuantileCostLoss(policy(), critic("cost_quantiles"), **{"cost_limit": 1.0, **options})
+
+
 def make_surrogate(**options: Any) -> CVaRSurrogateLoss:
     networks = critic("cost_value", inputs=3), critic("cost_variance", inputs=3, positive=True)
     return CVaRSurrogateLoss(*networks, **{"cost_limit": 1.0, **options})
 
 
 tsallis, cvar, surrogate = cache(make_tsallis), cache(make_cvar), cache(make_surrogate)
+quantile = cache(lambda: make_quantile().make_value_estimator())
 
 
 @cache
@@ -322,6 +329,26 @@ for name, owner, call in (
         "must be finite",
         state=weights(owner),
     )
+for name, values, allowed in (
+    ("kp", (-1.0, NAN, INF), "at least 0"),
+    ("ki", (0.0, -1.0, NAN), "positive finite number"),
+    ("tighten", (-0.1, 1.5, NAN), "at least 0, at most 1"),
+    ("loosen", (-0.1, NAN, INF), "at least 0"),
+):
+    each("LimitController", LimitController, name, values, allowed)
+controller = cache(LimitController)
+for name, values, allowed in (
+    ("level", (NAN, INF), "finite number"),
+    ("cost_limit", (-1.0, NAN, INF), "finite number, at least 0"),
+):
+    each(
+        "LimitController.update",
+        lambda **option: controller().update(**{"level": 1.0, "cost_limit": 1.0, **option}),
+        name,
+        values,
+        allowed,
+        state=lambda: controller().integral.item(),
+    )
 make_pid = partial(PIDMultiplier, kp=1.0, ki=1.0)
 each("PIDMultiplier", make_pid, "num_constraints", (0, 1.5), "at least 1")
 for name in ("kp", "ki", "kd", "init"):
@@ -422,6 +449,18 @@ each("CVaRCostLoss", make_cvar, "num_cost_nets", (0, 1.5, True), "at least 1")
 each(
     "CVaRCostLoss", make_cvar, "variance_reward", ("none",), "one of ['second_moment', 'td_error']"
 )
+for name, values, allowed in (
+    ("cost_limit", (-1.0, NAN, INF), "finite number, at least 0"),
+    ("risk_level", risk_levels, "in (0, 1]"),
+    ("num_cost_nets", (0, 1.5, True), "at least 1"),
+    ("num_samples", (0, 1.5, True), "at least 1"),
+    ("kappa", (-1.0, NAN, INF), "finite number, at least 0"),
+    ("pessimism", (-1.0, NAN, INF), "finite number, at least 0"),
+    ("pessimism", (1.0,), "num_cost_nets of at least 2"),
+    ("level", ("median",), "one of 'mean', 'realised'"),
+    ("reduction", ("median",), "one of 'none', 'mean', 'sum'"),
+):
+    each("QuantileCostLoss", make_quantile, name, values, allowed)
 each(
     "CVaRSurrogateLoss", make_surrogate, "cost_limit", (-1.0, NAN, INF), "finite number, at least 0"
 )
@@ -436,13 +475,17 @@ for owner, make in {
     each(owner, make, "reduction", ("median",), "one of 'none', 'mean', 'sum'")
 for owner, loss in {
     "CVaRCostLoss": cvar,
+    "QuantileCostLoss": quantile,
     "CVaRSurrogateLoss": surrogate,
     "ReturnSurrogateLoss": return_surrogate,
 }.items():
     name = f"{owner}.make_value_estimator"
     make = loss().make_value_estimator
     each(name, make, "gamma", gammas, "in [0, 1)", state=weights(loss))
-    each(name, make, "lmbda", (-0.1, 1.5), "in [0, 1]", state=weights(loss))
+    allowed = "in [0, 1]"
+    if loss is quantile:  # its default, sums of real costs, has no lambda
+        make, allowed = partial(make, "tdlambda"), "at least 0, at most 1"
+    each(name, make, "lmbda", (-0.1, 1.5), allowed, state=weights(loss))
 bad(
     "CVaRCostLoss.make_value_estimator: value_type",
     lambda: cvar().make_value_estimator(ValueEstimators.GAE),
@@ -514,6 +557,7 @@ bad(
 )
 for owner, loss, key in (
     ("CVaRCostLoss", cvar, ("next", "observation")),
+    ("QuantileCostLoss", quantile, ("next", "observation")),
     ("CVaRSurrogateLoss", surrogate, "observation"),
 ):
     bad(
@@ -525,7 +569,11 @@ for owner, loss, key in (
         "which has",
         state=weights(loss),
     )
-for owner, loss in {"CVaRCostLoss": cvar, "CVaRSurrogateLoss": surrogate}.items():
+for owner, loss in {
+    "CVaRCostLoss": cvar,
+    "QuantileCostLoss": quantile,
+    "CVaRSurrogateLoss": surrogate,
+}.items():
     for name, values, allowed in (
         ("cost_limit", (-1.0, NAN, INF, "1"), "finite number, at least 0"),
         ("risk_level", risk_levels, "in (0, 1]"),

@@ -21,42 +21,48 @@ from torchrl_safe.envs.randomization import (
 from torchrl_safe.envs.registration import register_envs
 from torchrl_safe.envs.robots import ROBOTS, Robot, get_robot
 from torchrl_safe.envs.tasks import GoalTask, NavigationTask
+from torchrl_safe.envs.tasks.velocity import VELOCITY_TASKS, VelocityTask, get_velocity_task
 from torchrl_safe.envs.transforms import SafeFrameSkip
 
 if TYPE_CHECKING:
     from torchrl_safe.envs.goal import SafeGoalEnv
     from torchrl_safe.envs.gymnasium import GymGoalEnv, GymGoalVectorEnv
+    from torchrl_safe.envs.velocity import SafeVelocityEnv
+    from torchrl_safe.envs.velocity_gymnasium import GymVelocityEnv, GymVelocityVectorEnv
 
 __all__ = [
     "JACKAL_REAL",
     "JACKAL_TRAINING",
     "RANDOMIZATIONS",
     "ROBOTS",
+    "VELOCITY_TASKS",
     "CostToReward",
     "GoalTask",
     "GymGoalEnv",
     "GymGoalVectorEnv",
+    "GymVelocityEnv",
+    "GymVelocityVectorEnv",
     "NavigationTask",
     "Randomization",
     "Robot",
     "SafeFrameSkip",
     "SafeGoalEnv",
+    "SafeVelocityEnv",
+    "VelocityTask",
     "check_safe_env",
     "cost_from_info",
     "get_robot",
+    "get_velocity_task",
 ]
 
 
 def __getattr__(name: str) -> Any:
-    if name == "SafeGoalEnv":
-        from torchrl_safe.envs.goal import SafeGoalEnv
+    if name not in __all__:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    from torchrl_safe.envs import goal, gymnasium, velocity, velocity_gymnasium
 
-        return SafeGoalEnv
-    if name in ("GymGoalEnv", "GymGoalVectorEnv"):
-        from torchrl_safe.envs import gymnasium
-
-        return getattr(gymnasium, name)
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    modules = (goal, gymnasium, velocity, velocity_gymnasium)
+    return getattr(next(module for module in modules if name in module.__all__), name)
 
 
 def __dir__() -> list[str]:

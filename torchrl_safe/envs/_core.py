@@ -1,14 +1,15 @@
 """The simulator behind every face of the environments: numpy in, numpy out, N at a time.
 
 This is the only file that touches MuJoCo's thread pool. It moves robots and keeps episodes; what
-is around the robots belongs to the task, as arrays and not as bodies in the physics model.
+is around the robots belongs to the task: arrays, which for a task with bodies say where in the
+physics model these start.
 """
 
 from __future__ import annotations
 
 import os
 import weakref
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from typing import Any, NamedTuple
 
 import mujoco
@@ -16,6 +17,7 @@ import numpy as np
 from mujoco.batch import Batch, SimulationError
 from numpy.typing import NDArray
 
+from torchrl_safe.envs._model import compile_model, pose, state_addresses
 from torchrl_safe.envs._process import keep_forever
 from torchrl_safe.envs._random import RandomStreams
 from torchrl_safe.envs.randomization import (
@@ -26,6 +28,7 @@ from torchrl_safe.envs.randomization import (
 )
 from torchrl_safe.envs.robots import Array, Motion, Robot, get_robot
 from torchrl_safe.envs.tasks import TASKS, Objects, Task
+from torchrl_safe.envs.tasks.bodies import Bodies
 
 Rows = NDArray[np.integer]
 Mask = NDArray[np.bool_]
@@ -36,46 +39,42 @@ _DIVERGED = [
     int(w) for w in (_WARNING.mjWARN_BADQPOS, _WARNING.mjWARN_BADQVEL, _WARNING.mjWARN_BADQACC)
 ]
 # MuJoCo's derived fields lag behind the state by one physics step, unless it is asked for them.
+_NOTHING = mujoco.mjtStage.mjSTAGE_NONE.value
 _ACCELERATION = mujoco.mjtStage.mjSTAGE_ACC.value
 _PHYSICS = ("time", "qpos", "qvel", "act")
 
 
-class RobotBatch:
-    """N copies of a robot on a thread pool.
+class SimulationPool:
+    """N simulations of a model on a thread pool.
 
     The pool is built at first use. Copies, pickles and forked processes leave it behind, keep the
-    simulations' state and build their own; rollouts do not depend on the number of threads.
+    simulations' state and build their own; what a simulation does never depends on the number of
+    threads.
 
     Args:
-        robot (Robot): the robot.
+        model (MjModel): the model of all.
         num_envs (int): how many, N.
         num_threads (int): threads that step them, this one included.
-        max_delay (int, optional): most environment steps a command can be late by. ``None`` for
-            robots that are all as their model, which is cheaper.
-
-    Attributes:
-        motion (Motion): where the robots are and what they sense. Accelerations are evaluated once
-            more after the last physics step, at the state it led to and under the same command.
-        variation (Variation or None): how the robots differ from their model.
-        commands (array or None): [N, max_delay + 1, nu], the last ones, newest first.
+        persistent (bool): whether each keeps what MuJoCo derived in its last step, to be asked for.
     """
 
+    _bound: tuple[str, ...] = (
+        "_initial",
+        "_qpos",
+        "_qvel",
+        "_qacc",
+        "_ctrl",
+        "_warning",
+        "_before",
+    )
+
     def __init__(
-        self, robot: Robot, num_envs: int, num_threads: int, max_delay: int | None = None
+        self, model: mujoco.MjModel, num_envs: int, num_threads: int, *, persistent: bool = False
     ) -> None:
-        self.robot = robot
         self.num_envs = num_envs
         self.num_threads = num_threads
-        plane = np.zeros((num_envs, 2))
-        self.motion = Motion(plane, plane, np.zeros((num_envs, len(robot.proprioception_scale))))
-        self.variation: Variation | None = None
-        self.commands: Array | None = None
-        self._model = mujoco.MjModel.from_xml_path(str(robot.asset_path))
-        self._model.opt.timestep = robot.timestep
-        if max_delay is not None:
-            one, zero = np.ones(num_envs), np.zeros(num_envs)
-            self.variation = Variation(one, one, one, zero, zero, zero)
-            self.commands = np.zeros((num_envs, max_delay + 1, self._model.nu))
+        self.persistent = persistent
+        self._model = model
         self._batch: Batch | None = None
         self._saved: Array | None = None
         self._closed = False
@@ -85,29 +84,29 @@ class RobotBatch:
         """The thread pool.
 
         Raises:
-            RuntimeError: if the robots are closed.
+            RuntimeError: if the simulations are closed.
         """
         if self._closed:
             raise RuntimeError("the environment is closed: make another one.")
         if self._batch is None:
-            self._batch = batch = Batch(self._model, self.num_envs, self.num_threads)
+            self._batch = Batch(self._model, self.num_envs, self.num_threads, self.persistent)
             _POOLS.add(self)
-            self._initial = batch.state[0].copy()
-            self._qpos, self._qvel = batch.bind("qpos"), batch.bind("qvel")
-            self._time = batch.bind("time")
-            self._ctrl, self._qacc = batch.bind("ctrl"), batch.bind("qacc")
-            self._warning = batch.warning
-            self._before = np.empty_like(batch.state)
-            if self.variation is not None:
-                self.vary(np.arange(self.num_envs), self.variation)
+            self._bind(self._batch)
             if self._saved is not None:
-                batch.state[:] = self._saved
+                self._batch.state[:] = self._saved
                 self._saved = None
         return self._batch
 
+    def _bind(self, batch: Batch) -> None:
+        """Looks up the arrays of a new pool; what is named in ``_bound`` is not copied with it."""
+        self._initial = batch.state[0].copy()
+        self._qpos, self._qvel = batch.bind("qpos"), batch.bind("qvel")
+        self._ctrl, self._qacc = batch.bind("ctrl"), batch.bind("qacc")
+        self._warning = batch.warning
+        self._before = np.empty_like(batch.state)
+
     def __getstate__(self) -> dict[str, Any]:
-        bound = ("_initial", "_qpos", "_qvel", "_time", "_ctrl", "_qacc", "_warning", "_before")
-        kept = {name: value for name, value in self.__dict__.items() if name not in bound}
+        kept = {name: value for name, value in self.__dict__.items() if name not in self._bound}
         saved = self._saved if self._batch is None else self._batch.state.copy()
         return kept | {"_batch": None, "_saved": saved}
 
@@ -125,6 +124,117 @@ class RobotBatch:
         """The live state, [N, S]: writing it is setting the simulations."""
         return self.batch.state
 
+    def advance(
+        self,
+        ctrl: Array,
+        substeps: int,
+        stage: int = _NOTHING,
+        *,
+        before_each: Callable[[], None] | None = None,
+    ) -> Mask:
+        """Makes some physics steps under the controls [N, nu], then evaluates a stage.
+
+        Args:
+            ctrl (array): [N, nu].
+            substeps (int): how many.
+            stage (int): what is evaluated at the state that they led to.
+
+        Keyword Args:
+            before_each (callable, optional): what else is set before each of the steps.
+
+        Returns:
+            array: [N], the simulations that diverged; they are put back where they were.
+        """
+        batch = self.batch
+        np.copyto(self._before, batch.state)
+        self._ctrl[:] = ctrl
+        failed = np.zeros(self.num_envs, bool)
+        calls, per_call = (1, substeps) if before_each is None else (substeps, 1)
+        for call in range(calls):
+            if before_each is not None:
+                before_each()
+            try:
+                batch.step(nstep=per_call, stage=stage if call == calls - 1 else _NOTHING)
+            except SimulationError:
+                failed |= batch.status != 0
+        if self._warning.any():  # hardly ever: what follows is left out
+            failed |= self._warning[:, _DIVERGED, 1].any(-1)
+        for value in (self._qpos, self._qvel, self._qacc):
+            # MuJoCo looks at the states that physics steps start from only. NaN compares false.
+            failed |= ~(np.abs(value).max(-1) < mujoco.mjMAXVAL)
+        if failed.any():
+            batch.state[failed] = self._before[failed]
+            self._warning[failed] = 0
+        return failed
+
+
+_POOLS: weakref.WeakSet[SimulationPool] = weakref.WeakSet()
+
+
+def _leave_pools() -> None:
+    for simulations in list(_POOLS):
+        simulations.leave_pool()
+    _POOLS.clear()
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_leave_pools)
+
+
+class RobotBatch(SimulationPool):
+    """N copies of a robot on a thread pool.
+
+    Args:
+        robot (Robot): the robot.
+        num_envs (int): how many, N.
+        num_threads (int): threads that step them, this one included.
+        max_delay (int, optional): most environment steps a command can be late by. ``None`` for
+            robots that are all as their model, which is cheaper.
+        bodies (tuple of Body, optional): what is around them in the physics model.
+
+    Attributes:
+        motion (Motion): where the robots are and what they sense. Accelerations are evaluated once
+            more after the last physics step, at the state it led to and under the same command.
+        variation (Variation or None): how the robots differ from their model.
+        commands (array or None): [N, max_delay + 1, nu], the last ones, newest first.
+    """
+
+    _bound = (*SimulationPool._bound, "_time", "_mocap_pos", "_mocap_quat", "_sensors")
+
+    def __init__(
+        self,
+        robot: Robot,
+        num_envs: int,
+        num_threads: int,
+        max_delay: int | None = None,
+        bodies: Bodies | None = None,
+    ) -> None:
+        model = compile_model(robot, bodies)
+        super().__init__(model, num_envs, num_threads)
+        self.robot = robot
+        self.bodies = bodies or ()
+        self._addresses = [state_addresses(model, body) for body in self.bodies]
+        self._towed = any(body.hold == "towed" for body in self.bodies)
+        self._has_sensors = bodies is not None
+        size = model.nsensordata if self._has_sensors else len(robot.proprioception_scale)
+        plane = np.zeros((num_envs, 2))
+        self.motion = Motion(plane, plane, np.zeros((num_envs, size)))
+        self.variation: Variation | None = None
+        self.commands: Array | None = None
+        if max_delay is not None:
+            one, zero = np.ones(num_envs), np.zeros(num_envs)
+            self.variation = Variation(one, one, one, zero, zero, zero)
+            self.commands = np.zeros((num_envs, max_delay + 1, model.nu))
+
+    def _bind(self, batch: Batch) -> None:
+        super()._bind(batch)
+        self._time = batch.bind("time")
+        self._mocap_pos, self._mocap_quat = batch.bind("mocap_pos"), batch.bind("mocap_quat")
+        if self._has_sensors:
+            self._sensors = batch.bind("sensordata")
+        if self.variation is not None:
+            self.vary(np.arange(self.num_envs), self.variation)
+
     def vary(self, rows: Rows, variation: Variation) -> None:
         """Makes the robots ``rows`` differ from their model, without compiling another one."""
         assert self.variation is not None
@@ -139,14 +249,48 @@ class RobotBatch:
         batch.expand("actuator_gainprm")[rows] = model.actuator_gainprm * gain[..., None]
         batch.set_const(rows)
 
-    def place(self, rows: Rows, position: Array, yaw: Array) -> None:
-        """Puts the robots ``rows`` at rest at position [n, 2] and yaw [n]."""
+    def place(
+        self, rows: Rows, position: Array, yaw: Array, objects: Objects | None = None
+    ) -> None:
+        """Puts the robots ``rows`` at rest at position [n, 2] and yaw [n], and bodies around."""
         batch = self.batch
         batch.state[rows] = self._initial
-        self._qpos[rows] = self.robot.place(position, yaw)
+        qpos = self.robot.place(position, yaw)
+        self._qpos[rows, : qpos.shape[1]] = qpos
+        self._place_bodies(rows, objects or {})
         if self.commands is not None:
             self.commands = _with_rows(self.commands, rows, np.zeros(1))
         self.perceive(rows)
+
+    def _place_bodies(self, rows: Rows, objects: Objects) -> None:
+        """At rest at ``objects[name]`` [n, K, 2], turned by ``objects[name + "_yaw"]`` [n, K]."""
+        column = rows[:, None]
+        for body, where in zip(self.bodies, self._addresses, strict=True):
+            xyz, quaternion = pose(body, objects[body.name], objects.get(f"{body.name}_yaw"))
+            if "qpos" in where:
+                index = where["qpos"][:, None] + np.arange(7)
+                self._qpos[rows[:, None, None], index] = np.concatenate((xyz, quaternion), -1)
+            if "anchor" in where:
+                xyz[..., 2] = 0.0
+                self._mocap_pos[column, where["anchor"]] = xyz
+            if "mocap" in where:
+                self._mocap_pos[column, where["mocap"]] = xyz
+                self._mocap_quat[column, where["mocap"]] = quaternion
+
+    def _tow(self) -> None:
+        """Moves what tows bodies to where it is at this time."""
+        time = self._time[:, None]
+        for body, where in zip(self.bodies, self._addresses, strict=True):
+            if body.hold == "towed":
+                offset = np.stack(
+                    (
+                        body.travel * np.sin(time),
+                        body.travel * np.cos(time),
+                        np.full_like(time, body.lift),
+                    ),
+                    -1,
+                )
+                self._mocap_pos[:, where["mocap"]] = self._mocap_pos[:, where["anchor"]] + offset
 
     def perceive(self, rows: Rows) -> None:
         """Evaluates what the robots ``rows`` sense where they are now."""
@@ -160,24 +304,14 @@ class RobotBatch:
         Returns:
             array: [N], the simulations that diverged; they are left as they were before the step.
         """
-        batch = self.batch
-        np.copyto(self._before, batch.state)
+        _ = self.batch  # builds the pool, whose arrays are read
         command = self.robot.control(action, self._qpos, self._qvel, self._time)
-        self._ctrl[:] = self._late(command)
-        try:
-            batch.step(nstep=self.robot.substeps, stage=_ACCELERATION)
-            failed = np.zeros(self.num_envs, bool)
-        except SimulationError:
-            failed = batch.status != 0
-        if self._warning.any():  # hardly ever: what follows is left out
-            failed |= self._warning[:, _DIVERGED, 1].any(-1)
-        for value in (self._qpos, self._qvel, self._qacc):
-            # MuJoCo looks at the states that physics steps start from only. NaN compares false.
-            failed |= ~(np.abs(value).max(-1) < mujoco.mjMAXVAL)
+        before_each = self._tow if self._towed else None
+        failed = self.advance(
+            self._late(command), self.robot.substeps, _ACCELERATION, before_each=before_each
+        )
         sensed = self._sense(slice(None))
         if failed.any():
-            batch.state[failed] = self._before[failed]
-            self._warning[failed] = 0
             pairs = zip(sensed, self.motion, strict=True)
             sensed = Motion(*(_with_rows(new, failed, old[failed]) for new, old in pairs))
         self.motion = sensed
@@ -186,6 +320,8 @@ class RobotBatch:
     def _sense(self, rows: Rows | slice) -> Motion:
         # Copies: what a robot returns may be part of the live state.
         sensed = self.robot.sense(self._qpos[rows], self._qvel[rows], self._qacc[rows])
+        if self._has_sensors:
+            sensed = sensed._replace(proprioception=self._sensors[rows])
         return Motion(*map(np.array, sensed))
 
     def _late(self, command: Array) -> Array:
@@ -195,19 +331,6 @@ class RobotBatch:
         self.commands = np.concatenate((command[:, None], self.commands[:, :-1]), 1)
         delay = self.variation.actuator_delay.astype(np.intp)
         return self.commands[np.arange(self.num_envs), delay]
-
-
-_POOLS: weakref.WeakSet[RobotBatch] = weakref.WeakSet()
-
-
-def _leave_pools() -> None:
-    for robots in list(_POOLS):
-        robots.leave_pool()
-    _POOLS.clear()
-
-
-if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=_leave_pools)
 
 
 class Frame(NamedTuple):
@@ -246,13 +369,7 @@ class Core:
         stagger: bool,
         randomization: Randomization | None,
     ) -> None:
-        for name, value in (
-            ("num_envs", num_envs),
-            ("num_threads", num_threads),
-            ("episode_length", episode_length),
-        ):
-            if not isinstance(value, int) or isinstance(value, bool) or value < 1:
-                raise ValueError(f"{name} must be an integer >= 1, got {value!r}.")
+        check_counts(num_envs=num_envs, num_threads=num_threads, episode_length=episode_length)
         # Fail where the options are given, not at the first reset of a worker process.
         *_, objects = task.sample(robot, RandomStreams(0, 4), np.arange(4))
         self.robot = robot
@@ -265,7 +382,8 @@ class Core:
         self.observation_size = task.observation_size(robot)
         self.randomization = randomization
         max_delay = None if randomization is None else randomization.actuator_delay[1]
-        self._robots = RobotBatch(robot, num_envs, num_threads, max_delay)
+        bodies = getattr(task, "bodies", None)
+        self._robots = RobotBatch(robot, num_envs, num_threads, max_delay, bodies)
         self._started = False
         self._objects: Objects = {
             name: np.zeros((num_envs, *value.shape[1:])) for name, value in objects.items()
@@ -306,7 +424,7 @@ class Core:
         position, yaw, objects = self.task.sample(self.robot, self._streams, rows)
         if self.randomization is not None:
             self._robots.vary(rows, self.randomization.sample(self._streams, rows))
-        self._robots.place(rows, position, yaw)
+        self._robots.place(rows, position, yaw, objects)
         self._objects = {
             name: _with_rows(old, rows, objects[name]) for name, old in self._objects.items()
         }
@@ -349,13 +467,7 @@ class Core:
         """
         if not self._started:
             raise RuntimeError("reset the environment before its first step.")
-        if action.shape != (self.num_envs, self.action_dim):
-            raise ValueError(
-                f"action must have shape {(self.num_envs, self.action_dim)}, got {action.shape}."
-            )
-        if not np.isfinite(action).all():
-            bad = np.flatnonzero(~np.isfinite(action).all(-1))
-            raise ValueError(f"action must be finite; it is not in environments {bad.tolist()}.")
+        check_action(action, (self.num_envs, self.action_dim))
         # In float64, whatever the face: a command computed in float32 would be another one.
         command = np.minimum(np.maximum(action, -1.0, dtype=np.float64), 1.0)
         diverged = self._robots.step(command)
@@ -436,8 +548,10 @@ class Core:
         }
 
     def qpos(self, index: int) -> Array:
-        """A copy of the generalised position [nq] of one environment."""
-        return self._robots.batch.bind("qpos")[index].copy()
+        """A copy of the robot's generalised position [nq] in one environment."""
+        position = self._robots.motion.position[:1]
+        size = self.robot.place(position, position[:, 0]).shape[1]
+        return self._robots.batch.bind("qpos")[index, :size].copy()
 
     def scan(self, index: int) -> Array:
         """The lidar's readings [R] in one environment, without noise."""
@@ -476,18 +590,7 @@ class Core:
             ValueError: if the snapshot is of another number of environments, robot or task;
                 nothing has changed then.
         """
-        current = self.snapshot()
-        if snapshot.keys() != current.keys():
-            raise ValueError(
-                f"snapshot must have the entries {sorted(current)}, got {sorted(snapshot)}."
-            )
-        for name, value in current.items():
-            new = snapshot[name]
-            if new.shape != value.shape or new.dtype != value.dtype:
-                raise ValueError(
-                    f"snapshot entry {name!r} must be {value.dtype} of shape {value.shape}, "
-                    f"got {new.dtype} of shape {new.shape}."
-                )
+        check_snapshot(snapshot, self.snapshot())
         copy = {name: np.array(value) for name, value in snapshot.items()}
         if self._robots.variation is not None:
             variation = Variation(*(copy[f"variation_{name}"] for name in Variation._fields))
@@ -547,6 +650,35 @@ def make_core(
         stagger=stagger,
         randomization=randomization,
     )
+
+
+def check_counts(**counts: int) -> None:
+    """Raises a ``ValueError`` unless each is an integer of at least 1."""
+    for name, value in counts.items():
+        if not isinstance(value, int) or isinstance(value, bool) or value < 1:
+            raise ValueError(f"{name} must be an integer >= 1, got {value!r}.")
+
+
+def check_action(action: Array, shape: tuple[int, int]) -> None:
+    """Raises a ``ValueError`` unless actions have the shape [N, A] and are finite."""
+    if action.shape != shape:
+        raise ValueError(f"action must have shape {shape}, got {action.shape}.")
+    if not np.isfinite(action).all():
+        bad = np.flatnonzero(~np.isfinite(action).all(-1))
+        raise ValueError(f"action must be finite; it is not in environments {bad.tolist()}.")
+
+
+def check_snapshot(snapshot: dict[str, NDArray[Any]], like: dict[str, NDArray[Any]]) -> None:
+    """Raises a ``ValueError`` unless it has the entries of another one, of its types and shapes."""
+    if snapshot.keys() != like.keys():
+        raise ValueError(f"snapshot must have the entries {sorted(like)}, got {sorted(snapshot)}.")
+    for name, value in like.items():
+        new = snapshot[name]
+        if new.shape != value.shape or new.dtype != value.dtype:
+            raise ValueError(
+                f"snapshot entry {name!r} must be {value.dtype} of shape {value.shape}, "
+                f"got {new.dtype} of shape {new.shape}."
+            )
 
 
 def _with_rows(array: NDArray[Any], rows: Rows | Mask, new: NDArray[Any]) -> NDArray[Any]:

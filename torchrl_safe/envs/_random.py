@@ -47,10 +47,24 @@ class RandomStreams:
 
     def uniform(self, rows: NDArray[np.integer], count: int) -> NDArray[np.float64]:
         """The next ``count`` numbers in [0, 1) of each stream in ``rows``: [len(rows), count]."""
-        steps = np.arange(1, count + 1, dtype=np.uint64) * _INCREMENT
-        z = self.state[rows, None] + steps
-        self.state[rows] = z[:, -1]
+        numbers = self.peek(rows, np.zeros(len(rows), np.int64), count)
+        self.skip(rows, count)
+        return numbers
+
+    def peek(
+        self, rows: NDArray[np.integer], ahead: NDArray[np.integer], count: int
+    ) -> NDArray[np.float64]:
+        """As :meth:`uniform`, of the numbers that follow the next ``ahead`` [n], drawing none.
+
+        Rows may come more than once.
+        """
+        steps = np.arange(1, count + 1, dtype=np.uint64)
+        z = self.state[rows, None] + (ahead.astype(np.uint64)[:, None] + steps) * _INCREMENT
         z = (z ^ (z >> np.uint64(30))) * _MIX_1
         z = (z ^ (z >> np.uint64(27))) * _MIX_2
         z ^= z >> np.uint64(31)
         return (z >> np.uint64(11)) * 2.0**-53
+
+    def skip(self, rows: NDArray[np.integer], count: int | NDArray[np.integer]) -> None:
+        """Leaves out the next ``count`` numbers, one for all or [n], of each stream in ``rows``."""
+        self.state[rows] += np.asarray(count).astype(np.uint64) * _INCREMENT

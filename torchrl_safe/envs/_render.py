@@ -204,6 +204,8 @@ class Scene:
         """Where the lidar's rays of environment ``index`` hit something: [K, 2]."""
         core, layout = self._core, self._core.layout(index)
         angle, distance = core.task.rays(core.scan(index))
+        if hasattr(core.task, "bodies"):  # in the frame of the robot's site
+            angle = angle + core.robot.frame_turn
         x, y = layout["heading"]
         ahead = np.stack((np.cos(angle), np.sin(angle)), -1) * distance[:, None]
         return layout["robot"] + ahead @ np.array([[x, y], [-y, x]])

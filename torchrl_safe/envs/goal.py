@@ -18,6 +18,8 @@ from torchrl_safe.envs.randomization import Randomization
 from torchrl_safe.envs.robots import Robot
 from torchrl_safe.envs.tasks import Task
 
+__all__ = ["SafeGoalEnv"]
+
 
 class SafeGoalEnv(EnvBase):
     """Robots driving to goals among hazards, N at a time in one process.

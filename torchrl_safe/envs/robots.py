@@ -33,7 +33,9 @@ class Motion(NamedTuple):
     Attributes:
         position (array): [N, 2], metres, world frame.
         heading (array): [N, 2], unit vector the robot faces, world frame.
-        proprioception (array): [N, P], what the robot senses of itself, in its own frame, unscaled.
+        proprioception (array): [N, P], what the robot senses of itself, in its own frame, unscaled;
+            in a task with bodies, all that its model's sensors read: see
+            :func:`torchrl_safe.envs.tasks.bodies.read_sensors`.
     """
 
     position: Array
@@ -61,6 +63,9 @@ class Robot:
         task (str): the name of the task it does by default.
         footprint (tuple of float, optional): half the length and half the width in metres of the
             rectangle around the robot that must not touch anything, for tasks with obstacles.
+        frame_turn (float): angle from the robot's heading to the x axis of its site ``"robot"``,
+            the frame of the sensors that a task with bodies adds.
+        balls (tuple of str): sites on passive ball joints, whose motion such a task shows, too.
 
     Raises:
         ValueError: if a number is out of its range.
@@ -82,6 +87,8 @@ class Robot:
     sense: Callable[[Array, Array, Array], Motion]
     task: str = "goal"
     footprint: tuple[float, float] | None = None
+    frame_turn: float = 0.0
+    balls: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         for name in ("timestep", "keepout"):
@@ -270,6 +277,9 @@ _CAR = Robot(
     place=partial(_place_free, height=0.0999, joints=(0.0, 0.0, 1.0, 0.0, 0.0, 0.0)),
     control=_control_directly,
     sense=_sense_free,
+    # Safety-Gymnasium's Car drives along -y.
+    frame_turn=np.pi / 2.0,
+    balls=("caster",),
 )
 
 _DOGGO_TORQUES = Robot(

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
-from torchrl_safe.objectives.cvar import CVaRCostLoss, MeasuredCVaR
+from torchrl_safe.objectives.common import MeasuredCVaR
+from torchrl_safe.objectives.cvar import CVaRCostLoss
 from torchrl_safe.objectives.lagrangian import LagrangeMultiplier, PIDMultiplier, lagrangian
+from torchrl_safe.objectives.limit import LimitController
+from torchrl_safe.objectives.quantile import QuantileCostLoss
 from torchrl_safe.objectives.surrogate import (
     CostMoments,
     CVaRSurrogateLoss,
@@ -16,8 +19,10 @@ __all__ = [
     "CVaRSurrogateLoss",
     "CostMoments",
     "LagrangeMultiplier",
+    "LimitController",
     "MeasuredCVaR",
     "PIDMultiplier",
+    "QuantileCostLoss",
     "ReturnSurrogateLoss",
     "TsallisLoss",
     "lagrangian",

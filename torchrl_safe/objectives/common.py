@@ -6,9 +6,11 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import TensorDictBase, TensorDictParams
+from tensordict.nn import ProbabilisticTensorDictSequential
 from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor
+from torch.distributions import Distribution
 from torchrl.objectives import LossModule
 from torchrl.objectives.value import ValueEstimatorBase
 
@@ -120,6 +122,16 @@ class CostLoss(TrajectoryLoss):
         check_cost_limit(self._cost_limit.item())
         self.risk_level = state.item()
 
+    def _check_single_steps(
+        self, tensordict: TensorDictBase, estimator: ValueEstimatorBase
+    ) -> None:
+        key = estimator.tensor_keys.steps_to_next_obs
+        if key in tensordict.keys(True) and (tensordict.get(key) != 1).any():
+            raise ValueError(
+                f"{key!r} must be 1 everywhere: costs are measured on single steps, not on sums "
+                "of several. Measure on the batch before it is made one of n-step transitions."
+            )
+
     def _measured_mean(
         self,
         tensordict: TensorDictBase,
@@ -128,13 +140,8 @@ class CostLoss(TrajectoryLoss):
         next_value: Callable[[TensorDictBase], Tensor],
     ) -> Tensor:
         """Mean over the visited states of the discounted cost that follows."""
+        self._check_single_steps(tensordict, estimator)
         cost, done, terminated, mask = self._read_steps(tensordict, cost_key, estimator)
-        key = estimator.tensor_keys.steps_to_next_obs
-        if key in tensordict.keys(True) and (tensordict.get(key) != 1).any():
-            raise ValueError(
-                f"{key!r} must be 1 everywhere: costs are measured on single steps, not on sums "
-                "of several. Measure on the batch before it is made one of n-step transitions."
-            )
         return visited_value_estimate(
             estimator.gamma,
             cost,
@@ -161,7 +168,132 @@ class CostLoss(TrajectoryLoss):
         )
 
 
+class MeasuredCVaR(NamedTuple):
+    """Where the cost of a policy stands.
+
+    What ``measure`` of :class:`~torchrl_safe.CVaRCostLoss` and of
+    :class:`~torchrl_safe.objectives.QuantileCostLoss` returns.
+
+    Attributes:
+        level (Tensor): mean CVaR of the policy, a scalar in units of the discounted cost sum.
+        reference (Tensor): the critics' CVaR at the policy's own actions, ``[*B]``.
+        horizon (Tensor): discounted number of steps for which a change of the policy is kept, a
+            scalar: ``1 / (1 - gamma)`` if nothing terminates.
+    """
+
+    level: Tensor
+    reference: Tensor
+    horizon: Tensor
+
+
+class CriticCostLoss(CostLoss):
+    """A loss of a cost whose critics are of states and actions: the constraint on their CVaR."""
+
+    actor_network: ProbabilisticTensorDictSequential
+    target_actor_network_params: TensorDictParams
+
+    def cvar(self, tensordict: TensorDictBase, action: Tensor) -> Tensor:
+        """What the critics say of states ``[*B]`` and actions, ``[*B]``."""
+        raise NotImplementedError
+
+    def on_policy_cvar(self, tensordict: TensorDictBase) -> Tensor:
+        """What the policy that took the given steps really meets, a scalar."""
+        raise NotImplementedError
+
+    @torch.no_grad()
+    def measure(
+        self, tensordict: TensorDictBase, action: Tensor, *, states: TensorDictBase | None = None
+    ) -> MeasuredCVaR:
+        """Where the cost of the current policy stands, for :meth:`constraint`.
+
+        Args:
+            tensordict (TensorDictBase): steps of the current policy, see :meth:`on_policy_cvar`.
+            action (Tensor): reparameterised actions of the current policy, ``[*B, D]``, from the
+                noise that actions will be drawn with in :meth:`constraint`.
+
+        Keyword Args:
+            states (TensorDictBase, optional): what :meth:`constraint` will be called with,
+                ``[*B]``, if that is not the tensordict itself.
+
+        Returns:
+            MeasuredCVaR: without gradient.
+
+        Raises:
+            KeyError: if an entry is missing.
+            ValueError: if steps are sums of several.
+        """
+        return MeasuredCVaR(
+            self.on_policy_cvar(tensordict),
+            self.cvar(tensordict if states is None else states, action),
+            self._measured_horizon(tensordict, self.tensor_keys.cost, self.value_estimator),
+        )
+
+    def constraint(
+        self, tensordict: TensorDictBase, action: Tensor, measured: MeasuredCVaR
+    ) -> Tensor:
+        r"""The constraint, feasible at or below 0, in the unit of ``cost_limit``.
+
+        .. math::
+
+            \text{level} + \text{horizon} \cdot E[\Gamma - \text{reference}] - d
+
+        (8) as written, ``cvar(tensordict, action).mean() - cost_limit``, follows the policy for one
+        action and the critics' policy from then on. A policy keeps its change: by the policy
+        gradient theorem, the effect on the discounted sum of following it at every step is
+        ``horizon`` times that of one action, ``1 / (1 - gamma)`` times if nothing terminates. At
+        the policy that was measured the constraint is how far its level is from the limit.
+
+        In a Lagrangian the objective must follow the policy for as long: put
+        :meth:`TsallisLoss.objective <torchrl_safe.TsallisLoss.objective>`, which is of one action,
+        beside :meth:`cvar`, or its mean over ``1 - gamma`` beside this. A trust region does not
+        mind how the objective is scaled.
+
+        Args:
+            tensordict (TensorDictBase): holds the critics' inputs but the action, ``[*B]``.
+            action (Tensor): reparameterised actions of the policy, ``[*B, D]``.
+            measured (MeasuredCVaR): what :meth:`measure` returned for the policy before its change,
+                with the same states and noise.
+
+        Returns:
+            The constraint, a scalar, in units of the discounted cost sum.
+
+        Raises:
+            TypeError: if ``measured`` is something else.
+            ValueError: if it was measured on another number of states.
+        """
+        if not isinstance(measured, MeasuredCVaR):
+            raise TypeError(
+                f"measured must be what measure(...) returned, got {type(measured).__name__}."
+            )
+        value = self.cvar(tensordict, action)
+        if value.shape != measured.reference.shape:
+            raise ValueError(
+                f"measured must be of the states in the tensordict, {tuple(value.shape)}, got a "
+                f"reference of shape {tuple(measured.reference.shape)}: hand them to measure, too."
+            )
+        change = self._mean(value - measured.reference, tensordict)
+        return measured.level + measured.horizon * change - self.cost_limit
+
+    def _target_dist(self, tensordict: TensorDictBase) -> Distribution:
+        with self.target_actor_network_params.to_module(
+            self.actor_network, preserve_module_state=False
+        ):
+            return self.actor_network.get_dist(tensordict)
+
+
 def spread(tensor: Tensor, like: Tensor) -> Tensor:
     """An entry of steps, in the shape of another that has more dimensions, as of agents."""
     missing = (1,) * (like.ndim - tensor.ndim)
     return tensor.reshape(*tensor.shape, *missing).expand_as(like)
+
+
+def next_key(key: NestedKey) -> NestedKey:
+    """The key of an entry of the next step."""
+    return unravel_key(("next", key))
+
+
+def joint(log_prob: Tensor | TensorDictBase) -> Tensor:
+    """Log-density of the whole action, also of one with several leaves."""
+    if isinstance(log_prob, TensorDictBase):
+        return torch.stack([*log_prob.values(True, True)]).sum(0)
+    return log_prob

@@ -3,21 +3,20 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import torch
 from tensordict import TensorDict, TensorDictBase, TensorDictParams
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule, dispatch
-from tensordict.utils import NestedKey, unravel_key
+from tensordict.utils import NestedKey
 from torch import Tensor, nn
-from torch.distributions import Distribution
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.modules.distributions.utils import sample_and_log_prob
 from torchrl.objectives import distance_loss
 from torchrl.objectives.utils import ValueEstimators
 from torchrl.objectives.value import ValueEstimatorBase
 
-from torchrl_safe.objectives.common import CostLoss, spread
+from torchrl_safe.objectives.common import CriticCostLoss, joint, next_key, spread
 from torchrl_safe.objectives.functional import check_regression, gaussian_cvar
 from torchrl_safe.objectives.utils import as_given, ensemble, make_estimator
 from torchrl_safe.objectives.value import (
@@ -31,22 +30,7 @@ from torchrl_safe.objectives.value.utils import behaviour_log_prob, get_entry, r
 VARIANCE_REWARDS = {"td_error": squared_td_error, "second_moment": retrace_variance_reward}
 
 
-class MeasuredCVaR(NamedTuple):
-    """Where the cost of a policy stands, from :meth:`CVaRCostLoss.measure`.
-
-    Attributes:
-        level (Tensor): mean CVaR of the policy, a scalar in units of the discounted cost sum.
-        reference (Tensor): the critics' CVaR at the policy's own actions, ``[*B]``.
-        horizon (Tensor): discounted number of steps for which a change of the policy is kept, a
-            scalar: ``1 / (1 - gamma)`` if nothing terminates.
-    """
-
-    level: Tensor
-    reference: Tensor
-    horizon: Tensor
-
-
-class CVaRCostLoss(CostLoss):
+class CVaRCostLoss(CriticCostLoss):
     r"""Safety critics and the constraint on the CVaR of the discounted cost, (6)-(8), (18).
 
     Two critics describe the discounted sum of costs that follows a state and an action by its
@@ -324,9 +308,9 @@ class CVaRCostLoss(CostLoss):
                     [
                         keys.action,
                         keys.log_prob,
-                        *(_next(key) for key in (keys.cost, keys.done, keys.terminated)),
+                        *(next_key(key) for key in (keys.cost, keys.done, keys.terminated)),
                         *self.actor_network.in_keys,
-                        *(_next(key) for key in self.actor_network.in_keys),
+                        *(next_key(key) for key in self.actor_network.in_keys),
                         *self.cost_network.in_keys,
                         *self.std_network.in_keys,
                     ]
@@ -411,8 +395,8 @@ class CVaRCostLoss(CostLoss):
             )
             mean, std, next_mean, next_std = (x.masked_fill(~mask, 0) for x in values)
             data = tensordict.select()
-            data.set(_next(keys.done), done)
-            data.set(_next(keys.terminated), terminated)
+            data.set(next_key(keys.done), done)
+            data.set(next_key(keys.terminated), terminated)
             if steps is not None:
                 data.set(estimator_keys.steps_to_next_obs, steps)
             options = {}
@@ -423,15 +407,15 @@ class CVaRCostLoss(CostLoss):
                     log_pi = self._target_dist(tensordict).log_prob(action)
                 else:
                     log_pi = policy.log_prob
-                data.set(keys.log_prob, spread(_joint(log_mu), cost[..., :1]))
-                options["policy_log_prob"] = spread(_joint(log_pi), cost[..., :1])
+                data.set(keys.log_prob, spread(joint(log_mu), cost[..., :1]))
+                options["policy_log_prob"] = spread(joint(log_pi), cost[..., :1])
 
             def estimate(
                 estimator: ValueEstimatorBase, reward: Tensor, value: Tensor, next_value: Tensor
             ) -> Tensor:
-                data.set(_next(keys.cost), reward)
+                data.set(next_key(keys.cost), reward)
                 data.set(action_value_key, value)
-                data.set(_next(estimator_keys.value), next_value)
+                data.set(next_key(estimator_keys.value), next_value)
                 return estimator.value_estimate(data, **options)
 
             mean_target = estimate(estimator, cost, mean, next_mean)
@@ -504,80 +488,6 @@ class CVaRCostLoss(CostLoss):
         std = self._mean(std.squeeze(-1).mean(0), tensordict)
         return gaussian_cvar(mean.to(std), std, self.risk_level)
 
-    @torch.no_grad()
-    def measure(
-        self, tensordict: TensorDictBase, action: Tensor, *, states: TensorDictBase | None = None
-    ) -> MeasuredCVaR:
-        """Where the cost of the current policy stands, for :meth:`constraint`.
-
-        Args:
-            tensordict (TensorDictBase): steps of the current policy, see :meth:`on_policy_cvar`.
-            action (Tensor): reparameterised actions of the current policy, ``[*B, D]``, from the
-                noise that actions will be drawn with in :meth:`constraint`.
-
-        Keyword Args:
-            states (TensorDictBase, optional): what :meth:`constraint` will be called with,
-                ``[*B]``, if that is not the tensordict itself.
-
-        Returns:
-            MeasuredCVaR: without gradient.
-
-        Raises:
-            KeyError: if an entry is missing.
-            ValueError: if steps are sums of several.
-        """
-        return MeasuredCVaR(
-            self.on_policy_cvar(tensordict),
-            self.cvar(tensordict if states is None else states, action),
-            self._measured_horizon(tensordict, self.tensor_keys.cost, self.value_estimator),
-        )
-
-    def constraint(
-        self, tensordict: TensorDictBase, action: Tensor, measured: MeasuredCVaR
-    ) -> Tensor:
-        r"""The constraint, feasible at or below 0, in the unit of ``cost_limit``.
-
-        .. math::
-
-            \text{level} + \text{horizon} \cdot E[\Gamma - \text{reference}] - d
-
-        (8) as written, ``cvar(tensordict, action).mean() - cost_limit``, follows the policy for one
-        action and the critics' policy from then on. A policy keeps its change: by the policy
-        gradient theorem, the effect on the discounted sum of following it at every step is
-        ``horizon`` times that of one action, ``1 / (1 - gamma)`` times if nothing terminates. At
-        the policy that was measured the constraint is how far its level is from the limit.
-
-        In a Lagrangian the objective must follow the policy for as long: put
-        :meth:`TsallisLoss.objective <torchrl_safe.TsallisLoss.objective>`, which is of one action,
-        beside :meth:`cvar`, or its mean over ``1 - gamma`` beside this. A trust region does not
-        mind how the objective is scaled.
-
-        Args:
-            tensordict (TensorDictBase): holds the critics' inputs but the action, ``[*B]``.
-            action (Tensor): reparameterised actions of the policy, ``[*B, D]``.
-            measured (MeasuredCVaR): what :meth:`measure` returned for the policy before its change,
-                with the same states and noise.
-
-        Returns:
-            The constraint, a scalar, in units of the discounted cost sum.
-
-        Raises:
-            TypeError: if ``measured`` is something else.
-            ValueError: if it was measured on another number of states.
-        """
-        if not isinstance(measured, MeasuredCVaR):
-            raise TypeError(
-                f"measured must be what measure(...) returned, got {type(measured).__name__}."
-            )
-        value = self.cvar(tensordict, action)
-        if value.shape != measured.reference.shape:
-            raise ValueError(
-                f"measured must be of the states in the tensordict, {tuple(value.shape)}, got a "
-                f"reference of shape {tuple(measured.reference.shape)}: hand them to measure, too."
-            )
-        change = self._mean(value - measured.reference, tensordict)
-        return measured.level + measured.horizon * change - self.cost_limit
-
     def _targets(self, tensordict: TensorDictBase, prediction: Tensor) -> tuple[Tensor, Tensor]:
         """Targets of mean and deviation, ``[*B]``: those in the data, or computed."""
         keys = self.tensor_keys.cost_target, self.tensor_keys.std_target
@@ -610,7 +520,7 @@ class CVaRCostLoss(CostLoss):
         in_keys = [*self.cost_network.in_keys, *self.std_network.in_keys]
         for key in in_keys:
             if key != self.tensor_keys.action:
-                get_entry(tensordict, _next(key), "an input of the critics at the next state")
+                get_entry(tensordict, next_key(key), "an input of the critics at the next state")
         in_keys += self.actor_network.in_keys
         following = repair_next(tensordict, in_keys).get("next")
         if action is None:
@@ -618,12 +528,6 @@ class CVaRCostLoss(CostLoss):
         critics = (self.target_cost_network_params, self.target_std_network_params)
         mean, std = self._predict(self._inputs(following, action), *critics)
         return mean.mean(0).unsqueeze(-1), std.mean(0).unsqueeze(-1)
-
-    def _target_dist(self, tensordict: TensorDictBase) -> Distribution:
-        with self.target_actor_network_params.to_module(
-            self.actor_network, preserve_module_state=False
-        ):
-            return self.actor_network.get_dist(tensordict)
 
     def _inputs(self, tensordict: TensorDictBase, action: Tensor) -> TensorDictBase:
         """What the critics read, with another action."""
@@ -639,14 +543,3 @@ class CVaRCostLoss(CostLoss):
         mean = self._vmap_cost_network(inputs, cost_params, keys.cost_value)
         std = self._vmap_std_network(inputs, std_params, keys.cost_std)
         return mean.squeeze(-1), std.squeeze(-1)
-
-
-def _next(key: NestedKey) -> NestedKey:
-    return unravel_key(("next", key))
-
-
-def _joint(log_prob: Tensor | TensorDictBase) -> Tensor:
-    """Log-density of the whole action, also of one with several leaves."""
-    if isinstance(log_prob, TensorDictBase):
-        return torch.stack([*log_prob.values(True, True)]).sum(0)
-    return log_prob

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import fields
+from functools import lru_cache
 from typing import Any, Literal, NamedTuple, Protocol
 
 import numpy as np
@@ -232,6 +233,53 @@ def offsets(position: Array, objects: Array) -> Array:
     planes = np.empty((2, *objects.shape[:-1]))
     np.subtract(objects.transpose(2, 0, 1), position.T[:, :, None], out=planes)
     return planes.transpose(1, 2, 0)
+
+
+def lidar_readings(ahead: Array, distance: Array, bins: int, reach: float) -> Array:
+    """Nearness of objects around the robot, by direction: Safety Gym's pseudo-lidar.
+
+    An object at distance d reads ``max(0, 1 - d / reach)`` in the bin it lies in, and that times
+    its position within the bin in the next one, times the complement in the previous one; a bin
+    keeps its largest reading. Bin 0 starts straight ahead, bins count to the left.
+
+    Args:
+        ahead (array): [N, K, 2], object minus robot, in the robot's frame.
+        distance (array): [N, K].
+        bins (int): angular bins, B; at least 3.
+        reach (float): distance at which the lidar reads zero.
+
+    Returns:
+        array: [N, B] in [0, 1].
+    """
+    num_envs = len(ahead)
+    turn = np.arctan2(ahead[..., 1], ahead[..., 0])
+    turn *= bins / (2.0 * np.pi)
+    np.add(turn, bins, out=turn, where=turn < 0.0)
+    centre = turn.astype(np.intp)
+    within = np.subtract(turn, centre, out=turn)
+    reading = distance / reach
+    np.subtract(1.0, reading, out=reading)
+    np.maximum(0.0, reading, out=reading)
+    shares = np.empty((3, *reading.shape))  # of a bin's left neighbour, its own, the right one's
+    np.subtract(1.0, within, out=shares[0])
+    shares[0] *= reading
+    shares[1] = reading
+    np.multiply(within, reading, out=shares[2])
+    # Column b + 1 is bin b. The margins, where neighbours across the seam fall, are folded back
+    # below; there are two on the right because an angle just below zero can round up to a full
+    # turn.
+    scan = np.zeros((num_envs, bins + 3))
+    columns = _columns(num_envs, bins + 3) + centre
+    np.maximum.at(scan.reshape(-1), columns.reshape(-1), shares.reshape(-1))
+    scan[:, 1:3] = np.maximum(scan[:, 1:3], scan[:, -2:])
+    scan[:, bins] = np.maximum(scan[:, bins], scan[:, 0])
+    return scan[:, 1:-2]
+
+
+@lru_cache(maxsize=64)
+def _columns(num_envs: int, width: int) -> NDArray[np.intp]:
+    """Where three neighbouring columns of an array [N, width] begin, [3, N, 1], in the flat one."""
+    return np.arange(3)[:, None, None] + np.arange(0, num_envs * width, width)[:, None]
 
 
 def check_options(task: Any, smallest: dict[str, int]) -> None:

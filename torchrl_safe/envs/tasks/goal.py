@@ -8,7 +8,6 @@ and the reward of SafeTAC, equation (19).
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,14 +22,12 @@ from torchrl_safe.envs.tasks.base import (
     Sensed,
     check_options,
     length,
+    lidar_readings,
     observe,
     offsets,
     pursue_goal,
 )
-
-_LAYOUT_CANDIDATES = 32  # positions tried for one object before its layout is started again
-_LAYOUT_ATTEMPTS = 100  # layouts started before giving up
-_GOAL_CANDIDATES = 256  # positions tried for a goal that moves during an episode
+from torchrl_safe.envs.tasks.layout import place_goal, scatter
 
 
 @dataclass(frozen=True)
@@ -174,39 +171,10 @@ def sample_layout(
     Raises:
         ValueError: if some environment found no layout: the objects do not fit the square.
     """
-    keepout = np.array(
-        (robot_keepout, task.goal_keepout) + (task.hazard_keepout,) * task.num_hazards
-    )
-    count = len(keepout)
-    half = task.extent - keepout
-    if half.min() < 0.0:
-        raise ValueError(f"a keepout of {keepout.max()} does not fit an extent of {task.extent}.")
-    gap = keepout[:, None] + keepout
-    # Positions are complex numbers here: a distance is one absolute value.
-    layout = np.empty((len(rows), count), complex)
-    pending = np.arange(len(rows))
-    for _ in range(_LAYOUT_ATTEMPTS):
-        draws = streams.uniform(rows[pending], count * _LAYOUT_CANDIDATES * 2) * 2.0 - 1.0
-        candidates = draws.view(complex).reshape(-1, count, _LAYOUT_CANDIDATES) * half[:, None]
-        placed = candidates[:, :, 0].copy()
-        legal = np.ones(len(pending), bool)
-        index = np.arange(len(pending))
-        for j in range(1, count):
-            distance = np.abs(candidates[:, j, :, None] - placed[:, None, :j])
-            free = (distance >= gap[j, :j]).all(-1)
-            first = free.argmax(-1)
-            legal &= free[index, first]
-            placed[:, j] = candidates[index, j, first]
-        layout[pending[legal]] = placed[legal]
-        pending = pending[~legal]
-        if not pending.size:
-            yaw = streams.uniform(rows, 1)[:, 0] * (2.0 * np.pi)
-            xy = layout.view(float).reshape(-1, count, 2)
-            return xy[:, 0], yaw, xy[:, 1], xy[:, 2:]
-    raise ValueError(
-        f"no legal layout found in {_LAYOUT_ATTEMPTS} attempts for {task} with a robot keepout of "
-        f"{robot_keepout}: use fewer hazards, smaller keepouts or a larger extent."
-    )
+    keepout = (robot_keepout, task.goal_keepout) + (task.hazard_keepout,) * task.num_hazards
+    layout = scatter(np.array(keepout), task.extent, streams, rows)
+    yaw = streams.uniform(rows, 1)[:, 0] * (2.0 * np.pi)
+    return layout[:, 0], yaw, layout[:, 1], layout[:, 2:]
 
 
 def sample_goal(
@@ -234,15 +202,9 @@ def sample_goal(
     Returns:
         array: [n, 2].
     """
-    draws = streams.uniform(rows, 2 * _GOAL_CANDIDATES).reshape(-1, _GOAL_CANDIDATES, 2)
-    candidates = (draws * 2.0 - 1.0) * (task.extent - task.goal_keepout)
-    clearance = length(candidates - robot[:, None]) - robot_keepout
-    if task.num_hazards:
-        to_hazards = length(candidates[:, :, None] - hazards[:, None]).min(-1) - task.hazard_keepout
-        clearance = np.minimum(clearance, to_hazards)
-    legal = clearance >= task.goal_keepout
-    choice = np.where(legal.any(-1), legal.argmax(-1), clearance.argmax(-1))
-    return candidates[np.arange(len(rows)), choice]
+    others = np.concatenate((robot[:, None], hazards), 1)
+    keepouts = np.array((robot_keepout,) + (task.hazard_keepout,) * task.num_hazards)
+    return place_goal(task.goal_keepout, task.extent, others, keepouts, streams, rows)
 
 
 def hazard_distances(position: Array, hazards: Array) -> tuple[Array, Array]:
@@ -267,36 +229,8 @@ def lidar(task: GoalTask, offset: Array, distance: Array, heading: Array) -> Arr
     Returns:
         array: [N, B] in [0, 1].
     """
-    bins, num_envs = task.lidar_bins, len(offset)
     ahead = to_robot_frame(offset, heading[:, None])
-    turn = np.arctan2(ahead[..., 1], ahead[..., 0])
-    turn *= bins / (2.0 * np.pi)
-    np.add(turn, bins, out=turn, where=turn < 0.0)
-    centre = turn.astype(np.intp)
-    within = np.subtract(turn, centre, out=turn)
-    reading = distance / task.lidar_range
-    np.subtract(1.0, reading, out=reading)
-    np.maximum(0.0, reading, out=reading)
-    shares = np.empty((3, *reading.shape))  # of a bin's left neighbour, its own, the right one's
-    np.subtract(1.0, within, out=shares[0])
-    shares[0] *= reading
-    shares[1] = reading
-    np.multiply(within, reading, out=shares[2])
-    # Column b + 1 is bin b. The margins, where neighbours across the seam fall, are folded back
-    # below; there are two on the right because an angle just below zero can round up to a full
-    # turn.
-    scan = np.zeros((num_envs, bins + 3))
-    columns = _columns(num_envs, bins + 3) + centre
-    np.maximum.at(scan.reshape(-1), columns.reshape(-1), shares.reshape(-1))
-    scan[:, 1:3] = np.maximum(scan[:, 1:3], scan[:, -2:])
-    scan[:, bins] = np.maximum(scan[:, bins], scan[:, 0])
-    return scan[:, 1:-2]
-
-
-@lru_cache(maxsize=64)
-def _columns(num_envs: int, width: int) -> NDArray[np.intp]:
-    """Where three neighbouring columns of an array [N, width] begin, [3, N, 1], in the flat one."""
-    return np.arange(3)[:, None, None] + np.arange(0, num_envs * width, width)[:, None]
+    return lidar_readings(ahead, distance, task.lidar_bins, task.lidar_range)
 
 
 def hazard_cost(task: GoalTask, distance: Array) -> tuple[Array, NDArray[np.bool_]]:

@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 from torchrl_safe.objectives.value.advantages import RetraceEstimator
+from torchrl_safe.objectives.value.distribution import (
+    distributional_retrace_estimate,
+    sampled_lambda_return_estimate,
+)
 from torchrl_safe.objectives.value.functional import (
     importance_sampling_lambda_return_estimate,
     q_lambda_return_estimate,
@@ -17,11 +21,13 @@ from torchrl_safe.objectives.value.policy import PolicyEvaluation, evaluate_poli
 __all__ = [
     "PolicyEvaluation",
     "RetraceEstimator",
+    "distributional_retrace_estimate",
     "evaluate_policy",
     "importance_sampling_lambda_return_estimate",
     "q_lambda_return_estimate",
     "retrace_lambda_return_estimate",
     "retrace_variance_reward",
+    "sampled_lambda_return_estimate",
     "squared_td_error",
     "tree_backup_lambda_return_estimate",
     "visited_value_estimate",

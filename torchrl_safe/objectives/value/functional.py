@@ -490,11 +490,7 @@ def _trace_return_estimate(
     """The recursion of all targets; the trace coefficient is ``lmbda * exp(log_trace)``."""
     terminated = done if terminated is None else terminated
     shape = reward.shape
-    if not -len(shape) <= time_dim < len(shape) - 1 or time_dim == -1:
-        raise ValueError(
-            f"time_dim must be a dimension of reward other than its last, of features; got "
-            f"time_dim={time_dim} for shape {tuple(shape)}."
-        )
+    _check_time_dim(time_dim, shape, "reward")
     _check_shape("action_value", action_value, shape, "that of reward")
     _check_shape("next_state_value", next_state_value, shape, "that of reward")
     _check_shape("done", done, shape, "that of reward")
@@ -591,6 +587,14 @@ def _check_shape(name: str, tensor: Tensor, expected: Sequence[int], origin: str
     if tensor.shape != tuple(expected):
         raise ValueError(
             f"{name} must have shape {tuple(expected)}, {origin}, got {tuple(tensor.shape)}."
+        )
+
+
+def _check_time_dim(time_dim: int, shape: Sequence[int], name: str) -> None:
+    if not -len(shape) <= time_dim < len(shape) - 1 or time_dim == -1:
+        raise ValueError(
+            f"time_dim must be a dimension of {name} other than its last, of features; got "
+            f"time_dim={time_dim} for shape {tuple(shape)}."
         )
 
 

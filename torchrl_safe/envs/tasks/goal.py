@@ -172,7 +172,10 @@ def sample_layout(
         ValueError: if some environment found no layout: the objects do not fit the square.
     """
     keepout = (robot_keepout, task.goal_keepout) + (task.hazard_keepout,) * task.num_hazards
-    layout = scatter(np.array(keepout), task.extent, streams, rows)
+    try:
+        layout = scatter(np.array(keepout), task.extent, streams, rows)
+    except ValueError as error:
+        raise ValueError(f"{task}: {error}") from error
     yaw = streams.uniform(rows, 1)[:, 0] * (2.0 * np.pi)
     return layout[:, 0], yaw, layout[:, 1], layout[:, 2:]
 

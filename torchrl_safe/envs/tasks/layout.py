@@ -62,7 +62,7 @@ def scatter(
         made, at_once = made + at_once, min(2 * at_once, _AT_ONCE)
     raise ValueError(
         f"no legal layout found in {_ATTEMPTS} attempts for {count} objects in an extent of "
-        f"{extent}: use fewer hazards (num_hazards), smaller keepouts or a larger extent."
+        f"{extent}: use fewer hazards or other objects, smaller keepouts or a larger extent."
     )
 
 

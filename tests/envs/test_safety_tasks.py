@@ -179,8 +179,9 @@ class TestEquality:
         touched = touching(core)
         frame = core.step(steps(name, "action"))
         touched |= touching(core)
-        # Between two looks there may be a touch as well.
-        touched |= np.roll(touched, 1) | np.roll(touched, -1)
+        # Between two looks there may be a touch as well, and what was pushed rocks for a while.
+        for _ in range(3):
+            touched = touched | np.roll(touched, 1) | np.roll(touched, -1)
         compared = ~first_steps(core, name)
         apart, size = compared & ~touched, own_size(core.robot)
         assert apart.mean() > 0.2
@@ -196,7 +197,7 @@ class TestEquality:
 
 
 def test_the_recorded_episodes_have_what_matters():
-    for source in set(SOURCES) - {"gremlins"}:
+    for source in SOURCES:
         assert sum(np.nansum(recorded(name)[f"cost_{source}"]) for name in NAMES) > 0, source
     for family in ("Goal", "Button"):
         assert sum(recorded(name)["goal_met"].sum() for name in NAMES if family in name) > 0

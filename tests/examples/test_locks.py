@@ -49,8 +49,9 @@ def test_a_killed_process_lets_go(tmp_path, number):
 
 def test_a_forked_child_does_not_keep_it(tmp_path):
     """Workers of a process that was killed live on for a while."""
-    fork = "import os, time; child = os.fork(); child or time.sleep(60); "
-    process = hold(tmp_path, fork + "print('held', flush=True); sys.stdin.read()")
+    # The child says so: what a fork does to it is then done.
+    child = "(print('held', flush=True), time.sleep(60))"
+    process = hold(tmp_path, f"import os, time; os.fork() or {child}; sys.stdin.read()")
     process.kill()
     process.wait()
     FolderLock(tmp_path).close()

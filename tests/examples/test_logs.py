@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import time
 
 import pytest
 from logs import Log, cut_csv
@@ -87,6 +88,7 @@ def test_tensorboard_forgets(tmp_path):
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
     write(tmp_path, FRAMES[:3], "tensorboard")
+    time.sleep(1.1)  # files are read in the order of their names, which count seconds
     write(tmp_path, FRAMES[2:], "tensorboard", after=200)
     events = EventAccumulator(str(tmp_path / "log")).Reload()
     assert [event.step for event in events.Scalars("train/cost")] == FRAMES

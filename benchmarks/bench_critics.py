@@ -10,15 +10,15 @@ import pytest
 import torch
 import torch.nn.functional as F
 from bench_training import compose
-from critics import make_critic_optim, make_losses, minibatches
-from descent import Descent
 from omegaconf import DictConfig
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import CudaGraphModule
 from torch import nn
-from utils import make_policy
 
 from torchrl_safe.envs import SafeGoalEnv
+from torchrl_safe.trainers.critics import make_critic_optim, make_losses, minibatches
+from torchrl_safe.trainers.descent import Descent
+from torchrl_safe.trainers.utils import make_policy
 
 
 def make_data(num_frames: int, observation_dim: int, action_dim: int) -> TensorDict:

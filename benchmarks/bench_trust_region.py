@@ -9,12 +9,9 @@ from typing import Any
 import pytest
 import torch
 from bench_training import compose
-from critics import make_losses
-from policy_steps import moment_kl, moments
 from safetac_point import policy_closure
 from tensordict import TensorDict
 from torch import Tensor
-from utils import make_policy
 
 from torchrl_safe import GMMTanhPolicy, TrustRegionSafeOptimizer
 from torchrl_safe.envs import SafeGoalEnv
@@ -27,6 +24,9 @@ from torchrl_safe.optim.curvature import (
     hessian_product,
 )
 from torchrl_safe.optim.repetition import CudaGraphRepeat, Repeat, one_by_one
+from torchrl_safe.trainers.critics import make_losses
+from torchrl_safe.trainers.policy_steps import moment_kl, moments
+from torchrl_safe.trainers.utils import make_policy
 
 NUM_STATES = 5000
 CG_ITERS = 10

@@ -30,8 +30,9 @@ from pathlib import Path
 sys.path.insert(0, str(Path(__file__).parents[1] / "examples"))
 
 import safetac_point
-import utils
 from bench_training import SILENT, compose, warm_up_updates
+
+from torchrl_safe.trainers import utils
 
 NUM_UPDATES = 16  # after the warm-up
 RATE = 25  # looks per second: each stops the example for milliseconds

@@ -26,14 +26,14 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "examples"))
 import numpy as np
 import safetac_point
 from bench_training import SILENT, compose, warm_up_updates
-from collectors import make_collector
-from critics import REPLAYED, make_buffer
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
 from omegaconf import DictConfig
-from utils import make_env, make_policy
 
 from torchrl_safe.record import read_metrics
+from torchrl_safe.trainers.collectors import make_collector
+from torchrl_safe.trainers.critics import REPLAYED, make_buffer
+from torchrl_safe.trainers.utils import make_env, make_policy
 
 ROOT = Path(__file__).resolve().parents[1]
 TABLE = ROOT / "benchmarks" / "results" / "scaling.csv"

@@ -10,10 +10,11 @@ from __future__ import annotations
 import hydra
 from omegaconf import DictConfig
 from trc import run_trc
-from utils import Run
+
+from torchrl_safe.trainers.utils import Run
 
 
-@hydra.main(config_path=".", config_name="cpo", version_base="1.3")
+@hydra.main(config_path="pkg://torchrl_safe.trainers", config_name="cpo", version_base="1.3")
 def main(cfg: DictConfig) -> None:
     """CPO as configured in cpo.yaml."""
     with Run(cfg) as run:

@@ -18,24 +18,24 @@ from typing import Any
 
 import hydra
 import torch
-from collectors import ResumableCollector
 from omegaconf import DictConfig
 from safetensors.torch import save_file
-from streams import stream_seed
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule
-from terminal import GracefulStop, progress_bar, say
 from torch import nn
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.modules import MLP, ProbabilisticActor, TanhNormal, ValueOperator
 from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
-from utils import Run, set_up
 from walking import Walking
 
 from torchrl_safe.envs import SafeGoalEnv
 from torchrl_safe.envs.legs import INPUT_SIZE, OTHER_SIDE, SIGNS, STEP
 from torchrl_safe.record import format_table
+from torchrl_safe.trainers.collectors import ResumableCollector
+from torchrl_safe.trainers.streams import stream_seed
+from torchrl_safe.trainers.terminal import GracefulStop, progress_bar, say
+from torchrl_safe.trainers.utils import Run, set_up
 
 USED = ["observation", "action", "action_log_prob", "advantage", "value_target"]
 
@@ -306,7 +306,9 @@ def evaluate(cfg: DictConfig, actor: ProbabilisticActor, env: SafeGoalEnv) -> di
     }
 
 
-@hydra.main(config_path=".", config_name="doggo_controller", version_base="1.3")
+@hydra.main(
+    config_path="pkg://torchrl_safe.trainers", config_name="doggo_controller", version_base="1.3"
+)
 def main(cfg: DictConfig) -> None:
     """Doggo's controller as configured in doggo_controller.yaml."""
     with Run(cfg) as run:

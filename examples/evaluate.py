@@ -16,15 +16,9 @@ from pathlib import Path
 from typing import NamedTuple
 
 import torch
-from checkpoints import load_components
-from critics import make_losses
 from omegaconf import DictConfig
-from run import write_results
-from saved import from_newest
-from streams import stream_seed
 from tensordict import TensorDictBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
-from utils import make_env, saved_policy
 
 from torchrl_safe import CVaRCostLoss, GMMTanhPolicy
 from torchrl_safe._files import expand, make_folder, printable
@@ -41,6 +35,12 @@ from torchrl_safe.record import (
     record_video,
     summarize,
 )
+from torchrl_safe.trainers.checkpoints import load_components
+from torchrl_safe.trainers.critics import make_losses
+from torchrl_safe.trainers.run import write_results
+from torchrl_safe.trainers.saved import from_newest
+from torchrl_safe.trainers.streams import stream_seed
+from torchrl_safe.trainers.utils import make_env, saved_policy
 
 NUM_FILMED = 9
 SEED = 0  # of layouts that neither training nor its evaluations see, whatever the number

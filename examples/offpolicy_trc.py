@@ -8,14 +8,20 @@ Every option is in offpolicy_trc.yaml, trc.yaml, constrained.yaml and base.yaml.
 from __future__ import annotations
 
 import hydra
-from critics import REPLAYED, make_buffer
-from descent import Descent
 from omegaconf import DictConfig
-from policy_steps import cost_limit_at, make_trust_region
-from surrogates import fit_critics, make_surrogates, policy_step, with_advantages
 from tensordict import TensorDictBase
 from torchrl._utils import timeit
-from utils import Run, make_eval_env, make_policy, set_up, train
+
+from torchrl_safe.trainers.critics import REPLAYED, make_buffer
+from torchrl_safe.trainers.descent import Descent
+from torchrl_safe.trainers.policy_steps import cost_limit_at, make_trust_region
+from torchrl_safe.trainers.surrogates import (
+    fit_critics,
+    make_surrogates,
+    policy_step,
+    with_advantages,
+)
+from torchrl_safe.trainers.utils import Run, make_eval_env, make_policy, set_up, train
 
 
 def run_offpolicy_trc(run: Run) -> None:
@@ -59,7 +65,9 @@ def run_offpolicy_trc(run: Run) -> None:
     train(run, policy, update, eval_env)
 
 
-@hydra.main(config_path=".", config_name="offpolicy_trc", version_base="1.3")
+@hydra.main(
+    config_path="pkg://torchrl_safe.trainers", config_name="offpolicy_trc", version_base="1.3"
+)
 def main(cfg: DictConfig) -> None:
     """Off-policy TRC as configured in offpolicy_trc.yaml."""
     with Run(cfg) as run:

@@ -18,14 +18,9 @@ from pathlib import Path
 
 import hydra
 import torch
-from config import check_config
-from descent import Descent
-from locks import FolderLock
 from omegaconf import DictConfig, OmegaConf
-from streams import stream_seed
 from tensordict import TensorDictBase
 from tensordict.nn import NormalParamExtractor, TensorDictModule
-from terminal import progress_bar
 from torch import Tensor, nn
 from torchrl._utils import logger as torchrl_logger
 from torchrl.collectors import Collector
@@ -37,6 +32,11 @@ from torchrl.objectives import SACLoss, SoftUpdate
 
 from torchrl_safe import RetraceEstimator
 from torchrl_safe._files import write_atomically
+from torchrl_safe.trainers.config import check_config
+from torchrl_safe.trainers.descent import Descent
+from torchrl_safe.trainers.locks import FolderLock
+from torchrl_safe.trainers.streams import stream_seed
+from torchrl_safe.trainers.terminal import progress_bar
 
 COLUMNS = ("frames", "seconds", "eval_return", "train_return", "alpha", "loss_qvalue", "trace")
 
@@ -83,7 +83,9 @@ def mean_trace(actor: ProbabilisticActor, batch: TensorDictBase) -> Tensor:
     return (log_pi - batch["action_log_prob"]).clamp(max=0).exp().mean()
 
 
-@hydra.main(config_path=".", config_name="retrace_sac", version_base="1.3")
+@hydra.main(
+    config_path="pkg://torchrl_safe.trainers", config_name="retrace_sac", version_base="1.3"
+)
 def main(cfg: DictConfig) -> None:
     """Train an agent and write its learning curve."""
     check_config(cfg)

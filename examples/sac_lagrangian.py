@@ -10,11 +10,14 @@ from __future__ import annotations
 
 import hydra
 from omegaconf import DictConfig
-from utils import Run
 from wcsac import run_wcsac
 
+from torchrl_safe.trainers.utils import Run
 
-@hydra.main(config_path=".", config_name="sac_lagrangian", version_base="1.3")
+
+@hydra.main(
+    config_path="pkg://torchrl_safe.trainers", config_name="sac_lagrangian", version_base="1.3"
+)
 def main(cfg: DictConfig) -> None:
     """SAC-Lagrangian as configured in sac_lagrangian.yaml."""
     with Run(cfg) as run:

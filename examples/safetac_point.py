@@ -13,7 +13,12 @@ from collections.abc import Callable
 
 import hydra
 import torch
-from critics import (
+from omegaconf import DictConfig
+from tensordict import TensorDict, TensorDictBase
+from torchrl._utils import timeit
+
+from torchrl_safe import CVaRCostLoss, GMMTanhPolicy, TsallisLoss
+from torchrl_safe.trainers.critics import (
     REPLAYED,
     CriticFit,
     make_buffer,
@@ -21,9 +26,8 @@ from critics import (
     make_losses,
     minibatches,
 )
-from descent import Descent
-from omegaconf import DictConfig
-from policy_steps import (
+from torchrl_safe.trainers.descent import Descent
+from torchrl_safe.trainers.policy_steps import (
     MOMENT_MATCHED,
     Distance,
     Multiplier,
@@ -32,11 +36,7 @@ from policy_steps import (
     cost_limit_at,
     make_trust_region,
 )
-from tensordict import TensorDict, TensorDictBase
-from torchrl._utils import timeit
-from utils import Run, make_eval_env, make_policy, set_up, train
-
-from torchrl_safe import CVaRCostLoss, GMMTanhPolicy, TsallisLoss
+from torchrl_safe.trainers.utils import Run, make_eval_env, make_policy, set_up, train
 
 
 def policy_closure(
@@ -151,7 +151,9 @@ def run_safetac(run: Run) -> None:
     train(run, policy, update, eval_env)
 
 
-@hydra.main(config_path=".", config_name="safetac_point", version_base="1.3")
+@hydra.main(
+    config_path="pkg://torchrl_safe.trainers", config_name="safetac_point", version_base="1.3"
+)
 def main(cfg: DictConfig) -> None:
     """SafeTAC as configured in safetac_point.yaml."""
     with Run(cfg) as run:

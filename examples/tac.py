@@ -10,16 +10,16 @@ from __future__ import annotations
 
 import hydra
 import torch
-from critics import REPLAYED
-from descent import Descent
 from omegaconf import DictConfig
 from tensordict import TensorDictBase
 from torchrl._utils import timeit
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.objectives import SoftUpdate
-from utils import Run, make_critic, make_eval_env, make_policy, set_up, train
 
 from torchrl_safe import TsallisLoss
+from torchrl_safe.trainers.critics import REPLAYED
+from torchrl_safe.trainers.descent import Descent
+from torchrl_safe.trainers.utils import Run, make_critic, make_eval_env, make_policy, set_up, train
 
 
 def run_tac(run: Run) -> None:
@@ -61,7 +61,7 @@ def run_tac(run: Run) -> None:
     train(run, policy, update, eval_env)
 
 
-@hydra.main(config_path=".", config_name="tac", version_base="1.3")
+@hydra.main(config_path="pkg://torchrl_safe.trainers", config_name="tac", version_base="1.3")
 def main(cfg: DictConfig) -> None:
     """Tsallis actor-critic as configured in tac.yaml."""
     with Run(cfg) as run:

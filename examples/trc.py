@@ -9,13 +9,19 @@ Every option is in trc.yaml, constrained.yaml and base.yaml beside this file.
 from __future__ import annotations
 
 import hydra
-from descent import Descent
 from omegaconf import DictConfig
-from policy_steps import cost_limit_at, make_trust_region
-from surrogates import fit_critics, make_surrogates, policy_step, with_advantages
 from tensordict import TensorDictBase
 from torchrl._utils import timeit
-from utils import Run, make_eval_env, make_policy, set_up, train
+
+from torchrl_safe.trainers.descent import Descent
+from torchrl_safe.trainers.policy_steps import cost_limit_at, make_trust_region
+from torchrl_safe.trainers.surrogates import (
+    fit_critics,
+    make_surrogates,
+    policy_step,
+    with_advantages,
+)
+from torchrl_safe.trainers.utils import Run, make_eval_env, make_policy, set_up, train
 
 
 def run_trc(run: Run) -> None:
@@ -49,7 +55,7 @@ def run_trc(run: Run) -> None:
     train(run, policy, update, eval_env)
 
 
-@hydra.main(config_path=".", config_name="trc", version_base="1.3")
+@hydra.main(config_path="pkg://torchrl_safe.trainers", config_name="trc", version_base="1.3")
 def main(cfg: DictConfig) -> None:
     """TRC as configured in trc.yaml."""
     with Run(cfg) as run:

@@ -15,10 +15,9 @@ import contextlib
 import time
 from pathlib import Path
 
-from saved import CONFIG, read_config
-
 from torchrl_safe._files import check_folder, expand, printable
 from torchrl_safe.record import format_table, plot_learning_curves, read_metrics
+from torchrl_safe.trainers.saved import CONFIG, read_config
 
 
 def look(run_dir: Path) -> str:

@@ -10,20 +10,20 @@ from __future__ import annotations
 
 import hydra
 import torch
-from critics import REPLAYED
-from descent import Descent
 from omegaconf import DictConfig
-from policy_steps import Multiplier, cost_limit_at
 from tensordict import TensorDictBase
 from torch import nn
 from torchrl._utils import timeit
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.objectives import SoftUpdate, ValueEstimators
-from utils import Run, make_critic, make_eval_env, make_policy, set_up, train
 
 from torchrl_safe import CVaRCostLoss, TsallisLoss
 from torchrl_safe.objectives import lagrangian
 from torchrl_safe.objectives.functional import q_logarithm
+from torchrl_safe.trainers.critics import REPLAYED
+from torchrl_safe.trainers.descent import Descent
+from torchrl_safe.trainers.policy_steps import Multiplier, cost_limit_at
+from torchrl_safe.trainers.utils import Run, make_critic, make_eval_env, make_policy, set_up, train
 
 
 def run_wcsac(run: Run) -> None:
@@ -106,7 +106,7 @@ def run_wcsac(run: Run) -> None:
     train(run, policy, update, eval_env)
 
 
-@hydra.main(config_path=".", config_name="wcsac", version_base="1.3")
+@hydra.main(config_path="pkg://torchrl_safe.trainers", config_name="wcsac", version_base="1.3")
 def main(cfg: DictConfig) -> None:
     """WCSAC as configured in wcsac.yaml."""
     with Run(cfg) as run:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-import config
 import hydra
 import make_table
 import numpy as np
@@ -15,6 +14,8 @@ import run_table
 import table_2
 import tiny
 from torchrl.record import CSVLogger
+
+from torchrl_safe.trainers import config
 
 ROOT = Path(__file__).parents[2]
 

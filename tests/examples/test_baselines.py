@@ -11,11 +11,11 @@ import evaluate
 import hydra
 import pytest
 import torch
-import utils
 import watch
 from tensordict import TensorDict
 
 from torchrl_safe import record
+from torchrl_safe.trainers import utils
 
 EXAMPLES = Path(utils.__file__).parent
 TINY = [

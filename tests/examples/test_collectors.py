@@ -5,7 +5,6 @@ from functools import partial
 
 import pytest
 import torch
-from collectors import BACKENDS, make_collector, worker_seed
 from omegaconf import OmegaConf
 from tensordict.nn import TensorDictModule
 from torch import nn
@@ -13,6 +12,7 @@ from torchrl.modules import MLP
 
 from torchrl_safe import GMMTanhPolicy
 from torchrl_safe.envs import SafeGoalEnv
+from torchrl_safe.trainers.collectors import BACKENDS, make_collector, worker_seed
 
 make_env = partial(SafeGoalEnv, "point", num_threads=1, episode_length=15, stagger=True)
 FRAMES = 120

@@ -3,11 +3,12 @@ from __future__ import annotations
 from importlib import util
 from pathlib import Path
 
-import config
 import hydra
 import pytest
 from omegaconf import OmegaConf, open_dict
-from policy_steps import MATCHED_BOUND, MOMENT_MATCHED, choose_distance
+
+from torchrl_safe.trainers import config
+from torchrl_safe.trainers.policy_steps import MATCHED_BOUND, MOMENT_MATCHED, choose_distance
 
 EXAMPLES = Path(config.__file__).parent
 CONFIGS = sorted(path.stem for path in EXAMPLES.glob("*.yaml"))

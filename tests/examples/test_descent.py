@@ -4,10 +4,11 @@ import copy
 
 import pytest
 import torch
-from descent import Descent
 from omegaconf import OmegaConf
 from tensordict import TensorDict
 from torch import nn
+
+from torchrl_safe.trainers.descent import Descent
 
 
 def make(max_norm: float | None, max_skipped: int = 0) -> tuple[nn.Module, Descent]:

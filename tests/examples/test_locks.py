@@ -8,9 +8,10 @@ import subprocess
 import sys
 from pathlib import Path
 
-import locks
 import pytest
-from locks import LOCK, FolderLock
+
+from torchrl_safe.trainers import locks
+from torchrl_safe.trainers.locks import LOCK, FolderLock
 
 HOLD = "import sys, pathlib, locks; lock = locks.FolderLock(pathlib.Path(sys.argv[1])); "
 

@@ -6,10 +6,10 @@ import errno
 import time
 
 import pytest
-from logs import Log, cut_csv
 from omegaconf import OmegaConf
 
 from torchrl_safe.record import read_metrics
+from torchrl_safe.trainers.logs import Log, cut_csv
 
 FRAMES = [100, 200, 300, 400]
 

@@ -7,16 +7,15 @@ import subprocess
 import sys
 
 import hydra
-import options
-import policy_steps
 import pytest
-import run as runs
-import saved
 import tiny
 import torch
 from omegaconf import OmegaConf
-from options import given, settings_of, settle
 from torch import nn
+
+from torchrl_safe.trainers import options, policy_steps, saved
+from torchrl_safe.trainers import run as runs
+from torchrl_safe.trainers.options import given, settings_of, settle
 
 
 def compose(*overrides, name="safetac_point"):
@@ -111,7 +110,7 @@ class TestSettle:
             settle(resolved(compose(name="tac")), compose("loss.alpha=0.5", name="tac"))
 
     def test_every_fixed_option_exists(self):
-        from config import RULES
+        from torchrl_safe.trainers.config import RULES
 
         assert set(options.FIXED) | set(options.LEARNED) <= RULES.keys()
 

@@ -8,10 +8,11 @@ import sys
 from pathlib import Path
 
 import pytest
-import run as runs
 import tiny
 import torch
-from run import Run, plain, write_results
+
+from torchrl_safe.trainers import run as runs
+from torchrl_safe.trainers.run import Run, plain, write_results
 
 
 def start(path: Path, *overrides: str) -> Run:

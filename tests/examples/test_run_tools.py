@@ -12,7 +12,6 @@ from collections import OrderedDict
 from pathlib import Path
 from types import SimpleNamespace
 
-import checkpoints
 import evaluate
 import export
 import numpy as np
@@ -21,15 +20,16 @@ import run_exported
 import torch
 import watch
 from omegaconf import OmegaConf
-from saved import Configuration, read_config, write_config
-from streams import stream_seed
 from tensordict import TensorDict
 from test_safetac_point import launch
 from torchrl.checkpoint import CheckpointError
 from torchrl.envs.utils import ExplorationType, set_exploration_type
-from utils import load_policy, load_run, make_env
 
 from torchrl_safe.modules import GMMTanhPolicy
+from torchrl_safe.trainers import checkpoints
+from torchrl_safe.trainers.saved import Configuration, read_config, write_config
+from torchrl_safe.trainers.streams import stream_seed
+from torchrl_safe.trainers.utils import load_policy, load_run, make_env
 
 
 @pytest.fixture(scope="module")
@@ -62,7 +62,8 @@ class TestLoadPolicy:
 
     def test_two_lines_of_a_script(self, run_dir):
         """As a user writes them, in a process of its own."""
-        lines = f"from utils import load_policy\npolicy = load_policy({str(run_dir)!r})"
+        load = "from torchrl_safe.trainers.utils import load_policy"
+        lines = f"{load}\npolicy = load_policy({str(run_dir)!r})"
         subprocess.run(
             [sys.executable, "-c", lines], check=True, cwd=Path(evaluate.__file__).parent
         )

@@ -11,17 +11,17 @@ import sys
 from pathlib import Path
 
 import hydra
-import logs
 import numpy as np
 import pytest
 import safetac_point
 import torch
-import utils
 from omegaconf import OmegaConf
 
-from torchrl_safe import record
+from torchrl_safe import record, trainers
+from torchrl_safe.trainers import logs, utils
 
 EXAMPLES = Path(safetac_point.__file__).parent
+CONFIGS = Path(trainers.__file__).parent
 TINY = [
     "num_threads=1",
     "env.num_envs=20",
@@ -42,7 +42,7 @@ TINY = [
 
 
 def launch(run_dir: Path, *overrides: str) -> None:
-    with hydra.initialize_config_dir(str(EXAMPLES), version_base="1.3"):
+    with hydra.initialize_config_dir(str(CONFIGS), version_base="1.3"):
         cfg = hydra.compose("safetac_point", [f"run_dir={run_dir}", *TINY, *overrides])
     safetac_point.main.__wrapped__(cfg)
 

@@ -6,10 +6,10 @@ import itertools
 
 import numpy as np
 import pytest
-from collectors import worker_seed
-from streams import stream_seed
 
 from torchrl_safe.envs import SafeGoalEnv
+from torchrl_safe.trainers.collectors import worker_seed
+from torchrl_safe.trainers.streams import stream_seed
 
 
 def test_is_numpys_sequence_of_name_and_numbers():

@@ -10,8 +10,9 @@ import sys
 from pathlib import Path
 
 import pytest
-import terminal
-from terminal import GracefulStop, Lenient, say
+
+from torchrl_safe.trainers import terminal
+from torchrl_safe.trainers.terminal import GracefulStop, Lenient, say
 
 TALK = """
 import sys, terminal

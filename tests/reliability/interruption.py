@@ -26,11 +26,11 @@ from pathlib import Path
 
 sys.path[:0] = [str(Path(__file__).parents[2] / "examples"), str(Path(__file__).parent)]
 
-import checkpoints  # noqa: E402
 import numpy as np  # noqa: E402
 import tiny  # noqa: E402
 
 from torchrl_safe.record import read_metrics  # noqa: E402
+from torchrl_safe.trainers import checkpoints  # noqa: E402
 
 INTERVAL = 2 * tiny.FRAMES
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGKILL)

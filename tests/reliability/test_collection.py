@@ -10,18 +10,16 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
-import checkpoints
-import collectors
 import numpy as np
 import pytest
 import tiny
 import torch
-import utils
 from tensordict.nn import TensorDictModule
 from torch import nn
 
 from torchrl_safe.envs import SafeGoalEnv, get_robot
 from torchrl_safe.record import read_metrics
+from torchrl_safe.trainers import checkpoints, collectors, utils
 
 DIE = Path("die")  # whoever deletes it ends itself
 STEPS = 12  # that a simulation lives, longer than a replayed slice

@@ -11,11 +11,8 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
 
-import critics
 import pytest
 import torch
-import utils
-from policy_steps import DISTANCES, MOMENT_MATCHED, Distance
 from tensordict import TensorDict
 from test_host_sync import HostReads
 from tiny import config, launch
@@ -31,6 +28,8 @@ from torchrl_safe import (
 )
 from torchrl_safe.objectives.value import PolicyEvaluation, evaluate_policy
 from torchrl_safe.record import read_metrics
+from torchrl_safe.trainers import critics, utils
+from torchrl_safe.trainers.policy_steps import DISTANCES, MOMENT_MATCHED, Distance
 
 OBS, ACT = 3, 2
 gpu = [

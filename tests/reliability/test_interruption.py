@@ -10,12 +10,12 @@ import subprocess
 import sys
 from pathlib import Path
 
-import checkpoints
 import pytest
 import tiny
 from torchrl.checkpoint import CheckpointError
 
 from torchrl_safe import record
+from torchrl_safe.trainers import checkpoints
 
 
 def frames_saved(run_dir: Path) -> list[str]:

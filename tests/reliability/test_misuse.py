@@ -13,7 +13,6 @@ from functools import cache, partial, reduce
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import config
 import gymnasium
 import hydra
 import numpy as np
@@ -64,6 +63,7 @@ from torchrl_safe.objectives import (
     value,
 )
 from torchrl_safe.objectives import functional as F
+from torchrl_safe.trainers import config
 
 NAN, INF = math.nan, math.inf
 SPEC = Bounded(-1.0, 1.0, (2,))

@@ -8,17 +8,15 @@ import itertools
 import math
 from pathlib import Path
 
-import critics
 import hydra
-import policy_steps
 import pytest
 import safetac_point
 import torch
-import utils
-from policy_steps import MATCHED_BOUND
 from torch.utils._pytree import tree_leaves
 
 from torchrl_safe import record
+from torchrl_safe.trainers import critics, policy_steps, utils
+from torchrl_safe.trainers.policy_steps import MATCHED_BOUND
 
 TINY = [
     "num_threads=1",

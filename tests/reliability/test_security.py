@@ -17,20 +17,18 @@ import time
 from pathlib import Path
 from types import SimpleNamespace
 
-import checkpoints
 import evaluate
 import export
 import numpy as np
 import pytest
 import run_exported
-import saved
 import tiny
-import utils
 import watch
 from omegaconf import OmegaConf
 from torchrl.checkpoint import CheckpointError
 
 from torchrl_safe import _files
+from torchrl_safe.trainers import checkpoints, saved, utils
 
 REPOSITORY = Path(__file__).parents[2]
 

@@ -8,7 +8,10 @@ import hydra
 import safetac_point
 from omegaconf import DictConfig
 
+from torchrl_safe import trainers
+
 EXAMPLES = Path(safetac_point.__file__).parent
+CONFIGS = Path(trainers.__file__).parent
 FRAMES = 100  # per update
 OVERRIDES = [
     "num_threads=1",
@@ -34,7 +37,7 @@ OVERRIDES = [
 
 
 def config(run_dir: Path, *overrides: str) -> DictConfig:
-    with hydra.initialize_config_dir(str(EXAMPLES), version_base="1.3"):
+    with hydra.initialize_config_dir(str(CONFIGS), version_base="1.3"):
         return hydra.compose("safetac_point", [f"run_dir={run_dir}", *OVERRIDES, *overrides])
 
 

@@ -11,23 +11,8 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
-from checkpoints import (
-    Rotation,
-    SealedCheckpoint,
-    latest,
-    read_manifest,
-    remove_leftovers,
-)
-from collectors import envs_per_batch
-from config import check_config
-from locks import FolderLock
-from logs import Log
 from omegaconf import DictConfig
-from options import settings_of, settle
-from saved import CONFIG, Configuration, read_config, write_config
-from streams import stream_seed
 from tensordict import TensorDictBase
-from terminal import say
 from torchrl.checkpoint import GlobalRNGState
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType
@@ -47,6 +32,21 @@ from torchrl_safe.record import (
     record_video,
     summarize,
 )
+from torchrl_safe.trainers.checkpoints import (
+    Rotation,
+    SealedCheckpoint,
+    latest,
+    read_manifest,
+    remove_leftovers,
+)
+from torchrl_safe.trainers.collectors import envs_per_batch
+from torchrl_safe.trainers.config import check_config
+from torchrl_safe.trainers.locks import FolderLock
+from torchrl_safe.trainers.logs import Log
+from torchrl_safe.trainers.options import settings_of, settle
+from torchrl_safe.trainers.saved import CONFIG, Configuration, read_config, write_config
+from torchrl_safe.trainers.streams import stream_seed
+from torchrl_safe.trainers.terminal import say
 
 HISTORY = "history.jsonl"
 RESULTS_LIMIT = 2**28  # bytes

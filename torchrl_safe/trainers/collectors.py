@@ -13,7 +13,6 @@ from typing import Any
 
 import torch
 from omegaconf import DictConfig
-from streams import stream_seed
 from tensordict import TensorDict, TensorDictBase
 from torchrl.collectors import (
     BaseCollector,
@@ -24,6 +23,8 @@ from torchrl.collectors import (
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType
 from torchrl.weight_update import SharedMemWeightSyncScheme
+
+from torchrl_safe.trainers.streams import stream_seed
 
 BACKENDS = ("single", "multi_sync", "multi_async", "ray")
 

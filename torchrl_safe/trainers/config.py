@@ -11,12 +11,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from collectors import BACKENDS
 from omegaconf import DictConfig, OmegaConf
-from options import flat
-from policy_steps import DISTANCES
 
 from torchrl_safe.envs import RANDOMIZATIONS, ROBOTS
+from torchrl_safe.trainers.collectors import BACKENDS
+from torchrl_safe.trainers.options import flat
+from torchrl_safe.trainers.policy_steps import DISTANCES
 
 LARGEST = float(np.finfo(np.float32).max)
 

@@ -7,7 +7,6 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import torch
-from descent import Descent
 from omegaconf import DictConfig
 from tensordict import TensorDictBase
 from tensordict.nn import CudaGraphModule
@@ -21,10 +20,11 @@ from torchrl.data import (
     TensorDictReplayBuffer,
 )
 from torchrl.envs import EnvBase
-from utils import make_critic
 
 from torchrl_safe import CVaRCostLoss, GMMTanhPolicy, TsallisLoss
 from torchrl_safe.objectives.value import PolicyEvaluation, evaluate_policy
+from torchrl_safe.trainers.descent import Descent
+from torchrl_safe.trainers.utils import make_critic
 
 REPLAYED = [
     "observation",

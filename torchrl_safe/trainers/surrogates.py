@@ -5,17 +5,17 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import torch
-from critics import minibatches
-from descent import Descent
 from omegaconf import DictConfig
-from policy_steps import moments
 from tensordict import TensorDict, TensorDictBase
 from torch import nn
 from torchrl.envs import EnvBase
-from utils import make_critic
 
 from torchrl_safe import GMMTanhPolicy, TrustRegionSafeOptimizer
 from torchrl_safe.objectives import CostMoments, CVaRSurrogateLoss, ReturnSurrogateLoss
+from torchrl_safe.trainers.critics import minibatches
+from torchrl_safe.trainers.descent import Descent
+from torchrl_safe.trainers.policy_steps import moments
+from torchrl_safe.trainers.utils import make_critic
 
 
 def make_surrogates(

@@ -2,7 +2,7 @@
 
 A trained policy, in two lines::
 
-    from utils import load_policy
+    from torchrl_safe.trainers.utils import load_policy
     policy = load_policy("runs/safetac_point/seed_0")
 """
 
@@ -17,15 +17,8 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from checkpoints import load_components
-from collectors import WorkerDied, make_collector
 from omegaconf import DictConfig
-from run import Run
-from saved import from_newest
-from saved import load_run as load_run
-from streams import stream_seed
 from tensordict import TensorDictBase
-from terminal import GracefulStop, progress_bar, say
 from torch import nn
 from torchrl._utils import logger as torchrl_logger
 from torchrl._utils import timeit
@@ -38,6 +31,13 @@ from torchrl_safe import GMMTanhPolicy
 from torchrl_safe._files import printable
 from torchrl_safe.envs import RANDOMIZATIONS, SafeGoalEnv
 from torchrl_safe.record import batch_metrics, count_violations
+from torchrl_safe.trainers.checkpoints import load_components
+from torchrl_safe.trainers.collectors import WorkerDied, make_collector
+from torchrl_safe.trainers.run import Run
+from torchrl_safe.trainers.saved import from_newest
+from torchrl_safe.trainers.saved import load_run as load_run
+from torchrl_safe.trainers.streams import stream_seed
+from torchrl_safe.trainers.terminal import GracefulStop, progress_bar, say
 
 
 def set_up(cfg: DictConfig) -> None:

@@ -10,8 +10,6 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import yaml
-from checkpoints import latest, load_components
-from config import check_options
 from omegaconf import DictConfig, OmegaConf
 from torchrl.checkpoint import CheckpointError
 
@@ -23,6 +21,8 @@ from torchrl_safe._files import (
     read_bytes,
     write_atomically,
 )
+from torchrl_safe.trainers.checkpoints import latest, load_components
+from torchrl_safe.trainers.config import check_options
 
 CONFIG = "config.yaml"
 CONFIG_LIMIT = 2**14  # bytes; brackets in brackets take the parser a while for each

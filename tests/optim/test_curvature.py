@@ -7,8 +7,8 @@ import torch
 from tensordict import TensorDict
 from torch import nn
 
+from torchrl_safe.modules import moment_matched_kl
 from torchrl_safe.modules.distributions import TanhGaussianMixture
-from torchrl_safe.objectives.functional import moment_matched_kl
 from torchrl_safe.optim.curvature import (
     conjugate_gradient,
     flatten,

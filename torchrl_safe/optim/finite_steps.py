@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
@@ -57,7 +58,7 @@ class FiniteSteps:
             raise ValueError(f"max_grad_norm must be a positive number, got {max_grad_norm!r}.")
         if not max_skipped >= 0:
             raise ValueError(f"max_skipped must be at least 0, got {max_skipped!r}.")
-        self.optimizer = optimizer
+        self.optimizer: Any = optimizer
         self.max_grad_norm = max_grad_norm
         self.max_skipped = max_skipped
         self._params = [param for group in optimizer.param_groups for param in group["params"]]
@@ -78,7 +79,8 @@ class FiniteSteps:
         if not terms:
             raise KeyError(f"losses must hold an entry 'loss_*', it has {sorted(losses.keys())}.")
         try:
-            sum(terms.values()).backward()  # some may be constant
+            total: Any = sum(terms.values())  # some may be constant
+            total.backward()
             norm = nn.utils.get_total_norm(p.grad for p in self._params if p.grad is not None)
             skip = norm.isfinite().logical_not().to(self._skipped.dtype)
             # As torch.amp.GradScaler does it: a fused optimizer divides gradients by the one, and

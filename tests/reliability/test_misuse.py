@@ -49,6 +49,7 @@ from torchrl_safe.envs import suite
 from torchrl_safe.modules import (
     DeterministicAction,
     GMMParamExtractor,
+    divergences,
     export_policy,
     mixture_moments,
 )
@@ -261,12 +262,20 @@ for name, moments in {
 }.items():
     bad(
         f"moment_matched_kl: {name}",
-        partial(F.moment_matched_kl, *moments),
+        partial(divergences.moment_matched_kl, *moments),
         ValueError,
         name,
         str(tuple(moments[("old_mean", "old_cov", "new_mean", "new_cov").index(name)].shape)),
         "must have shape (2",
     )
+bad(
+    "categorical_kl: new_logits",
+    lambda: divergences.categorical_kl(zeros(5, 3), zeros(5, 2)),
+    ValueError,
+    "new_logits",
+    "(5, 2)",
+    "must have shape (5, 3)",
+)
 MIXTURE = {
     f"{age}_{name}": torch.ones(shape)
     for age in ("old", "new")
@@ -275,7 +284,7 @@ MIXTURE = {
 for name in (name for name in MIXTURE if name != "old_loc"):
     bad(
         f"matched_bound_kl: {name}",
-        partial(F.matched_bound_kl, **{**MIXTURE, name: zeros(5, 1)}),
+        partial(divergences.matched_bound_kl, **{**MIXTURE, name: zeros(5, 1)}),
         ValueError,
         name,
         "(5, 1)",

@@ -11,8 +11,8 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from torchrl_safe import GMMTanhPolicy, TanhGaussianMixture, TrustRegionSafeOptimizer
+from torchrl_safe.modules import matched_bound_kl, moment_matched_kl
 from torchrl_safe.objectives import LagrangeMultiplier, PIDMultiplier, lagrangian
-from torchrl_safe.objectives.functional import matched_bound_kl, moment_matched_kl
 from torchrl_safe.trainers.descent import Descent
 from torchrl_safe.trainers.options import settings_of
 

@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 import signal
-import sys
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from functools import partial
-from pathlib import Path
 from queue import Empty
 from typing import Any
 
 import torch
-from omegaconf import DictConfig
 from tensordict import TensorDict, TensorDictBase
 from torchrl.collectors import (
     BaseCollector,
@@ -24,13 +21,12 @@ from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType
 from torchrl.weight_update import SharedMemWeightSyncScheme
 
+from torchrl_safe.trainers.options import MethodOptions
 from torchrl_safe.trainers.streams import stream_seed
-
-BACKENDS = ("single", "multi_sync", "multi_async", "ray")
 
 
 def make_collector(
-    cfg: DictConfig,
+    options: MethodOptions,
     make_env: Callable[..., EnvBase],
     policy: Callable[[TensorDictBase], TensorDictBase],
     *,
@@ -44,13 +40,13 @@ def make_collector(
     * ``multi_async``: the same without waiting: an update sees the batch of one worker,
       ``[N / num_workers, T]``, begun before the update that came before it.
     * ``ray``: as ``multi_sync``, in actors of the Ray cluster that ``RAY_ADDRESS`` or this machine
-      has, else of one started here. Its machines need this library, not the example's files.
+      has, else of one started here. Its machines need this library.
 
     Call ``update_policy_weights_`` on it after every update. If a worker dies, it or the next batch
     raises :class:`WorkerDied` within seconds, with the other workers stopped.
 
     Args:
-        cfg (DictConfig): the run's configuration.
+        options (MethodOptions): the run's.
         make_env (callable): makes environments from the keywords ``num_envs`` and ``seed``. Workers
             receive a pickled copy.
         policy (callable): acts.
@@ -62,38 +58,37 @@ def make_collector(
     Raises:
         ValueError: if the backend is unknown, or the workers cannot share the environments equally.
     """
-    backend, num_workers = cfg.collector.backend, cfg.collector.num_workers
-    if backend not in BACKENDS:
-        raise ValueError(f"collector.backend must be one of {BACKENDS}, got {backend!r}.")
-    options = {
-        "frames_per_batch": cfg.collector.frames_per_batch,
+    backend, num_workers = options.collector.backend, options.collector.num_workers
+    how = {
+        "frames_per_batch": options.collector.frames_per_batch,
         "total_frames": total_frames,
         "exploration_type": ExplorationType.RANDOM,
         "auto_register_policy_transforms": False,
     }
     if backend == "single":
-        env = make_env(num_envs=cfg.env.num_envs, seed=seed)
-        return ResumableCollector(env, policy, **options)
-    if num_workers < 1 or cfg.env.num_envs % num_workers:
+        env = make_env(num_envs=options.env.num_envs, seed=seed)
+        return ResumableCollector(env, policy, **how)
+    if num_workers < 1 or options.env.num_envs % num_workers:
         raise ValueError(
-            f"collector.num_workers={num_workers} must divide env.num_envs={cfg.env.num_envs}."
+            f"collector.num_workers={num_workers} must divide env.num_envs={options.env.num_envs}."
         )
-    share = cfg.env.num_envs // num_workers
+    share = options.env.num_envs // num_workers
     creators: list[Callable[[], EnvBase]] = [
         partial(_in_worker, make_env, share, worker_seed(seed, i)) for i in range(num_workers)
     ]
     if backend == "ray":
-        return _ray_collector(creators, policy, options)
-    options["weight_sync_schemes"] = {"policy": _Weights()}
+        return _ray_collector(creators, policy, how)
+    how["weight_sync_schemes"] = {"policy": _Weights()}
     if backend == "multi_sync":
-        return _SyncCollector(creators, policy, cat_results="stack", postproc=_joined, **options)
-    return _AsyncCollector(creators, policy, **options)
+        return _SyncCollector(creators, policy, cat_results="stack", postproc=_joined, **how)
+    return _AsyncCollector(creators, policy, **how)
 
 
-def envs_per_batch(cfg: DictConfig) -> int:
-    """How many environments a batch of :func:`make_collector` is of."""
-    shared = cfg.collector.get("backend") == "multi_async"
-    return cfg.env.num_envs // (cfg.collector.num_workers if shared else 1)
+def envs_per_batch(settings: Mapping[str, Any]) -> int:
+    """How many environments a batch of :func:`make_collector` is of, by a run's settings."""
+    collector = settings["collector"]
+    shared = collector["backend"] == "multi_async"
+    return settings["env"]["num_envs"] // (collector["num_workers"] if shared else 1)
 
 
 class ResumableCollector(Collector):
@@ -190,7 +185,7 @@ class _Weights(SharedMemWeightSyncScheme):
 def _ray_collector(
     creators: list[Callable[[], EnvBase]],
     policy: Callable[[TensorDictBase], TensorDictBase],
-    options: dict[str, Any],
+    how: dict[str, Any],
 ) -> BaseCollector:
     import ray
     from torchrl.collectors.distributed import RayCollector
@@ -207,11 +202,7 @@ def _ray_collector(
                     ended[i] = type(error).__name__
             return ended
 
-    here = Path(__file__).parent
-    for module in list(sys.modules.values()):
-        if (path := getattr(module, "__file__", None)) and Path(path).parent == here:
-            ray.cloudpickle.register_pickle_by_value(module)
-    transforms = options.pop("auto_register_policy_transforms")
+    transforms = how.pop("auto_register_policy_transforms")
     return WatchedRayCollector(
         creators,
         policy,
@@ -220,7 +211,7 @@ def _ray_collector(
         collector_kwargs=[{"auto_register_policy_transforms": transforms} for _ in creators],
         remote_configs={"num_cpus": 1},
         ray_init_config={"include_dashboard": False},
-        **options,
+        **how,
     )
 
 

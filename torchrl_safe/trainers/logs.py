@@ -14,7 +14,6 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-from omegaconf import DictConfig
 from torchrl.record.loggers import CSVLogger, Logger, TensorboardLogger, get_logger
 
 from torchrl_safe._files import (
@@ -25,6 +24,7 @@ from torchrl_safe._files import (
     replacing,
     write_atomically,
 )
+from torchrl_safe.trainers.options import Logger as LoggerOptions
 
 NAME = "log"
 WANDB_ID = "wandb_id"
@@ -38,36 +38,36 @@ class Log:
     in all of its parts, kept in the folder.
 
     Args:
-        cfg (DictConfig): the run's configuration.
+        options (Logger): the run's ``logger``.
         path (Path): the run's folder.
         frames (int): frames that the run goes on from.
         finishing (bool): whether only the final evaluation is left, which is then logged anew.
     """
 
-    def __init__(self, cfg: DictConfig, path: Path, frames: int, *, finishing: bool) -> None:
+    def __init__(self, options: LoggerOptions, path: Path, frames: int, *, finishing: bool) -> None:
         self._folder = path
         self._logger: Logger | None
         if os.path.lexists(path / NAME):
             regular_files(path / NAME)  # or a link would be written through
         if os.path.lexists(path / "wandb"):
             check_folder(path / "wandb")  # it makes links in there itself
-        if cfg.logger.backend == "csv":
+        if options.backend == "csv":
             if (path / NAME).exists():
                 cut_csv(path / NAME, frames, finishing=finishing)
             self._logger = CSVLogger(NAME, str(path))
-        elif cfg.logger.backend == "tensorboard":
+        elif options.backend == "tensorboard":
             self._logger = _Purging(NAME, str(path), purge_step=frames + 1)
         else:
             os.environ.setdefault("WANDB_MODE", "offline")
-            options: dict[str, Any] = {"project": cfg.logger.project_name, "dir": str(path)}
-            if cfg.logger.backend == "wandb":
-                options["id"] = _wandb_id(path)
+            wandb: dict[str, Any] = {"project": options.project_name, "dir": str(path)}
+            if options.backend == "wandb":
+                wandb["id"] = _wandb_id(path)
             with nobody_to_ask():
                 self._logger = get_logger(
-                    cfg.logger.backend,
+                    options.backend,
                     logger_name=str(path),
                     experiment_name=NAME,
-                    wandb_kwargs=options,
+                    wandb_kwargs=wandb,
                 )
 
     def write(self, metrics: Mapping[str, float], frames: int) -> None:

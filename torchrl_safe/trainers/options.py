@@ -63,7 +63,7 @@ def option(
     """
     if type(default) is int and "le" not in bounds:
         bounds["le"] = MOST
-    extra = {"choices": choices, "allowed": allowed, "fixed": fixed}
+    extra: Any = {"choices": choices, "allowed": allowed, "fixed": fixed}
     return Field(default, description=meaning, json_schema_extra=extra, **bounds)
 
 
@@ -544,11 +544,11 @@ def describe(group: type[Group], prefix: str = "") -> list[Description]:
     return rows
 
 
-def settle(saved: Options, new: Options) -> tuple[Options, dict[str, tuple[Any, Any]]]:
+def settle(saved: Mapping[str, Any], new: Options) -> tuple[Options, dict[str, tuple[Any, Any]]]:
     """The options with which a saved run goes on, and what of them changes.
 
     Args:
-        saved (Options): the run's options so far.
+        saved (mapping): the :meth:`~Options.settings` of the run so far, maybe of an older version.
         new (Options): those of the call; what is not :func:`given` stays as it was.
 
     Returns:
@@ -559,17 +559,18 @@ def settle(saved: Options, new: Options) -> tuple[Options, dict[str, tuple[Any, 
     """
     changed: dict[str, tuple[Any, Any]] = {}
     fixed = set()
-    if saved.method != new.method:  # who starts another method says so
-        changed["method"], fixed = (saved.method, new.method), {"method"}
-    before, values = dict(flat(saved)), dict(flat(new))
+    if saved.get("method") != new.method:  # who starts another method says so
+        changed["method"], fixed = (saved.get("method"), new.method), {"method"}
+    values = dict(flat(new))
     repeated = given(new)
     for name, value in values.items():
-        if name in OF_THE_CALL or name not in before or before[name] == value:
+        before = _look_up(saved, name, value)
+        if name in OF_THE_CALL or before == value:
             continue
         if name in repeated:
-            changed[name] = (before[name], value)
+            changed[name] = (before, value)
         else:
-            values[name] = before[name]
+            values[name] = before
     fixed |= {row.name for row in describe(type(new)) if row.fixed} & changed.keys()
     if fixed:
         was = ", ".join(
@@ -642,6 +643,15 @@ def _nested(values: Mapping[str, Any]) -> dict[str, Any]:
             inner = inner.setdefault(group, {})
         inner[last] = value
     return nested
+
+
+def _look_up(settings: Mapping[str, Any], name: str, otherwise: Any) -> Any:
+    value: Any = settings
+    for part in name.split("."):
+        if not isinstance(value, Mapping) or part not in value:
+            return otherwise
+        value = value[part]
+    return value
 
 
 def _choices(extra: Mapping[str, Any]) -> Collection[Any] | None:

@@ -11,7 +11,6 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
-from omegaconf import DictConfig
 from tensordict import TensorDictBase
 from torchrl.checkpoint import GlobalRNGState
 from torchrl.envs import EnvBase
@@ -40,10 +39,9 @@ from torchrl_safe.trainers.checkpoints import (
     remove_leftovers,
 )
 from torchrl_safe.trainers.collectors import envs_per_batch
-from torchrl_safe.trainers.config import check_config
 from torchrl_safe.trainers.locks import FolderLock
 from torchrl_safe.trainers.logs import Log
-from torchrl_safe.trainers.options import settings_of, settle
+from torchrl_safe.trainers.options import MethodOptions, settings_of, settle
 from torchrl_safe.trainers.saved import CONFIG, Configuration, read_config, write_config
 from torchrl_safe.trainers.streams import stream_seed
 from torchrl_safe.trainers.terminal import say
@@ -70,25 +68,25 @@ class Run:
 
     A run has its folder from :meth:`start` to :meth:`close`, before anything is built and alone::
 
-        with Run(cfg) as run:  # run.cfg, from here on
+        with Run(options) as run:  # run.options, from here on
             ...  # build
             run.restore(policy=policy)
             ...  # train, run.log(metrics), run.save()
 
     Args:
-        cfg (DictConfig): the options of this call. A resumed run keeps its own for those that are
+        options (MethodOptions): those of this call. A resumed run keeps its own for those that are
             not given again.
     """
 
-    def __init__(self, cfg: DictConfig) -> None:
-        self.cfg = cfg
-        self.path = expand(cfg.run_dir)
+    def __init__(self, options: MethodOptions) -> None:
+        self.options: Any = options.model_copy(deep=True)
+        self.path = expand(options.folder)
         self.counters = Counters(frames=0, total_cvs=0, instabilities=0, seconds=0.0)
         self.changed: dict[str, tuple[Any, Any]] = {}
         self.checkpoint = SealedCheckpoint()
         self._components: dict[str, Any] = {}
         self._saved: int | None = None  # frames of the newest checkpoint
-        self._saved_options: DictConfig | None = None
+        self._saved_options: Mapping[str, Any] | None = None
         self._lock: FolderLock | None = None
         self._log: Log | None = None
         self._without_curves = False
@@ -115,11 +113,11 @@ class Run:
                 set, or holds checkpoints without the options that belong to them.
             FileNotFoundError: if there is nothing to resume.
         """
-        check_config(self.cfg)
-        if not self.cfg.resume:
+        self.options.check_installed()
+        if not self.options.resume:
             self.path.mkdir(parents=True, exist_ok=True)
         elif not self.path.is_dir():
-            raise FileNotFoundError(f"run_dir={self.cfg.run_dir} holds no run to resume from.")
+            raise FileNotFoundError(f"run_dir={self.options.folder} holds no run to resume from.")
         self._lock = FolderLock(self.path)
         try:
             self._settle()
@@ -128,7 +126,7 @@ class Run:
             raise
 
     def _settle(self) -> None:
-        run_dir, resume = self.cfg.run_dir, self.cfg.resume
+        run_dir, resume = self.options.folder, self.options.resume
         exists = os.path.lexists(self.path / CONFIG)
         if not exists and latest(self.path) is not None:
             raise FileExistsError(
@@ -145,12 +143,12 @@ class Run:
         if resume:
             remove_leftovers(self.path)
             self._saved_options = read_config(self.path / CONFIG)
-            self.cfg, self.changed = settle(self._saved_options, self.cfg)
-            check_config(self.cfg)
-        self.cfg.run_dir = str(self.path)
-        self.rotation = Rotation(self.path, self.cfg.checkpoint.keep_last)
+            self.options, self.changed = settle(self._saved_options, self.options)
+            self.options.check_installed()
+        self.options.run_dir = str(self.path)
+        self.rotation = Rotation(self.path, self.options.checkpoint.keep_last)
         self.register(
-            config=Configuration(self.cfg), counters=self.counters, random=GlobalRNGState()
+            config=Configuration(self.options), counters=self.counters, random=GlobalRNGState()
         )
 
     def register(self, **components: Any) -> None:
@@ -190,12 +188,12 @@ class Run:
             self._saved = self.frames
         if self.finished:
             return
-        self._log = Log(self.cfg, self.path, self.frames, finishing=not self.frames_left)
+        self._log = Log(self.options.logger, self.path, self.frames, finishing=not self.frames_left)
         for name, (old, new) in self.changed.items():
             say(f"from frame {self.frames} on, {name} is {new!r}; it was {old!r}")
         self._remember()
         # Last: where the log cannot be opened, there is no run.
-        write_config(self.path / CONFIG, self.cfg)
+        write_config(self.path / CONFIG, self.options)
 
     def close(self) -> None:
         """Close the log, and let go of the folder."""
@@ -214,7 +212,7 @@ class Run:
     @property
     def frames_left(self) -> int:
         """Frames that the configuration still asks for."""
-        return max(0, self.cfg.collector.total_frames - self.frames)
+        return max(0, self.options.collector.total_frames - self.frames)
 
     @property
     def finished(self) -> bool:
@@ -230,11 +228,13 @@ class Run:
         """Replay and running episodes have a column for every environment of a batch."""
         if not {"buffer", "collector"} & self._components.keys() or self._saved_options is None:
             return
-        saved, new = (envs_per_batch(cfg) for cfg in (self._saved_options, self.cfg))
+        saved, new = (
+            envs_per_batch(each) for each in (self._saved_options, self.options.settings())
+        )
         if saved != new:
             raise ValueError(
-                f"run_dir={self.cfg.run_dir} has batches of {saved} environments and cannot go on "
-                f"with batches of {new}: leave env.num_envs as it was, with "
+                f"run_dir={self.options.run_dir} has batches of {saved} environments and cannot go "
+                f"on with batches of {new}: leave env.num_envs as it was, with "
                 "collector.backend=multi_async env.num_envs / collector.num_workers."
             )
 
@@ -242,8 +242,8 @@ class Run:
         """Episodes of several processes are in no checkpoint."""
         if "collector" in self._components.keys() - read_manifest(checkpoint)["components"]:
             raise ValueError(
-                f"collector.backend={self.cfg.collector.backend} goes on inside of episodes, "
-                f"and the checkpoints in run_dir={self.cfg.run_dir} hold none: leave "
+                f"collector.backend={self.options.collector.backend} goes on inside of episodes, "
+                f"and the checkpoints in run_dir={self.options.run_dir} hold none: leave "
                 "collector.backend as it was."
             )
 
@@ -291,22 +291,22 @@ class Run:
         policy: Callable[[TensorDictBase], TensorDictBase],
         stream: str,
     ) -> dict[str, TensorDictBase]:
-        loss = self.cfg.loss
+        loss = self.options.loss
         return {
             prefix: evaluate(
                 env,
                 policy,
-                num_steps=self.cfg.eval.num_steps,
+                num_steps=self.options.eval.num_steps,
                 exploration_type=kind,
                 seed=stream_seed(stream),
-                cost_gamma=loss.get("cost_gamma", loss.gamma),
+                cost_gamma=getattr(loss, "cost_gamma", loss.gamma),
             )
             for prefix, kind in KINDS.items()
         }
 
     def plot(self) -> None:
         """Draw the learning curves, if it can be done; they need the csv log."""
-        if self.cfg.logger.backend != "csv":
+        if self.options.logger.backend != "csv":
             return
         try:
             plot_learning_curves(self.path / "log", self.path / "curves.png")
@@ -344,10 +344,10 @@ class Run:
             "frames/s": results["frames_per_second"],
         }
         say(format_table(rows))
-        if self.cfg.video.num_steps:
+        if self.options.video.num_steps:
             try:
                 path = record_video(
-                    env, policy, self.path / "video.mp4", num_steps=self.cfg.video.num_steps
+                    env, policy, self.path / "video.mp4", num_steps=self.options.video.num_steps
                 )
                 say(f"video: {path}")
             except Exception as error:  # whatever it is, the results are written

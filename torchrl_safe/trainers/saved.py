@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import yaml
-from omegaconf import DictConfig, OmegaConf
 from torchrl.checkpoint import CheckpointError
 
 from torchrl_safe._files import (
@@ -22,7 +21,7 @@ from torchrl_safe._files import (
     write_atomically,
 )
 from torchrl_safe.trainers.checkpoints import latest, load_components
-from torchrl_safe.trainers.config import check_options
+from torchrl_safe.trainers.options import Options, flat
 
 CONFIG = "config.yaml"
 CONFIG_LIMIT = 2**14  # bytes; brackets in brackets take the parser a while for each
@@ -37,36 +36,36 @@ T = TypeVar("T")
 
 
 class Configuration:
-    """The resolved configuration as a component of each checkpoint.
+    """The options as a component of each checkpoint.
 
-    Whoever goes on with a run keeps its own; the one of the checkpoint is in :attr:`saved`.
+    Whoever goes on with a run keeps its own; those of the checkpoint are in :attr:`saved`.
 
     Args:
-        cfg (DictConfig, optional): the run's.
+        options (Options, optional): the run's.
     """
 
-    def __init__(self, cfg: DictConfig | None = None) -> None:
-        self.cfg = OmegaConf.create() if cfg is None else cfg
+    def __init__(self, options: Options | None = None) -> None:
+        self.options = options
         self.saved: dict[str, Any] = {}
 
     def state_dict(self) -> dict[str, Any]:
         """The options."""
-        return OmegaConf.to_container(self.cfg, resolve=True)
+        return {} if self.options is None else self.options.settings()
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Keep the options of a checkpoint."""
         self.saved = dict(state)
 
 
-def write_config(path: Path, cfg: DictConfig) -> None:
-    """Write a resolved configuration, sealed by its last line."""
-    text = OmegaConf.to_yaml(cfg, resolve=True)
+def write_config(path: Path, options: Options) -> None:
+    """Write all options, sealed by the last line."""
+    text = yaml.safe_dump(options.settings(), sort_keys=False)
     seal = hashlib.sha256(text.encode()).hexdigest()
     write_atomically(path, f"{text}{SEAL.decode()}{seal}\n")
 
 
-def read_config(path: Path) -> DictConfig:
-    """A configuration as :func:`write_config` wrote it.
+def read_config(path: Path) -> dict[str, Any]:
+    """The settings that :func:`write_config` wrote.
 
     Raises:
         FileNotFoundError: if there is none.
@@ -86,11 +85,11 @@ def read_config(path: Path) -> DictConfig:
         options = yaml.load(sealed.decode(), _PlainLoader)
     except (yaml.YAMLError, RecursionError, ValueError) as error:
         raise CheckpointError(f"{printable(path)} is no plain YAML: {printable(error)}") from None
-    return _plain_config(path, options)
+    return _plain_settings(path, options)
 
 
-def load_run(run_dir: str | os.PathLike[str]) -> tuple[DictConfig, Path]:
-    """The configuration in a run's newest checkpoint, and the checkpoint's path.
+def load_run(run_dir: str | os.PathLike[str]) -> tuple[Options, Path]:
+    """The options in a run's newest checkpoint, and the checkpoint's path.
 
     A run is looked at on the CPU, wherever it was trained. While it trains, the checkpoint may be
     gone when it is read: see :func:`from_newest`.
@@ -113,21 +112,20 @@ def load_run(run_dir: str | os.PathLike[str]) -> tuple[DictConfig, Path]:
         raise FileNotFoundError(f"run_dir={printable(run_dir)} has no checkpoint yet.")
     config = Configuration()
     load_components(checkpoint, config=config)
-    cfg = _plain_config(checkpoint, config.saved)
+    settings = _plain_settings(checkpoint, config.saved)
     try:
-        cfg.device = "cpu"
-        cfg.num_threads = min(cfg.num_threads, os.cpu_count() or 1)
-        check_options(cfg)
-        _check_cost(cfg)
+        num_threads = min(settings.get("num_threads", 1), os.cpu_count() or 1)
+        options = Options.from_settings({**settings, "device": "cpu", "num_threads": num_threads})
+        _check_cost(options)
     except (ValueError, TypeError) as error:
         raise CheckpointError(
             f"the configuration in {printable(checkpoint)} is none: {printable(error)}"
         ) from None
-    return cfg, checkpoint
+    return options, checkpoint
 
 
-def from_newest(run_dir: str | os.PathLike[str], read: Callable[[DictConfig, Path], T]) -> T:
-    """What ``read`` makes of a run's configuration and newest checkpoint.
+def from_newest(run_dir: str | os.PathLike[str], read: Callable[[Options, Path], T]) -> T:
+    """What ``read`` makes of a run's options and newest checkpoint.
 
     A run that trains deletes a checkpoint when it has written the next; then the next is read. All
     that ``read`` returns is of one.
@@ -149,33 +147,21 @@ def from_newest(run_dir: str | os.PathLike[str], read: Callable[[DictConfig, Pat
                 raise
 
 
-def _plain_config(path: Path, options: Any) -> DictConfig:
-    """Options without anything that OmegaConf would resolve."""
-    if not isinstance(options, dict):
+def _plain_settings(path: Path, settings: Any) -> dict[str, Any]:
+    """Settings under names."""
+    if not isinstance(settings, dict) or not all(isinstance(name, str) for name in settings):
         raise CheckpointError(f"{printable(path)} holds no options.")
-    pending: list[Any] = [options]
-    while pending:
-        value = pending.pop()
-        if isinstance(value, dict):
-            pending += [*value, *value.values()]
-        elif isinstance(value, list):
-            pending += value
-        elif isinstance(value, str) and "${" in value:
-            raise CheckpointError(f"{printable(path)} refers to something else: {value!a}.")
-    try:
-        return OmegaConf.create(options)
-    except Exception as error:  # of kinds that are OmegaConf's own
-        raise CheckpointError(f"{printable(path)} holds no options: {printable(error)}") from None
+    return settings
 
 
-def _check_cost(cfg: DictConfig) -> None:
+def _check_cost(options: Options) -> None:
+    values = dict(flat(options))
     for name, most in MOST.items():
-        if (OmegaConf.select(cfg, name) or 0) > most:
+        if values.get(name, 0) > most:
             raise ValueError(f"{name} must be at most {most:,} to look at a run.")
-    outputs = ENDS * (OmegaConf.select(cfg, "policy.num_components") or 1)
+    outputs = ENDS * values.get("policy.num_components", 1)
     for name in ("policy.num_cells", "critic.num_cells", "network.num_cells"):
-        cells = OmegaConf.select(cfg, name) or []
-        sizes = [ENDS, *cells, outputs]
+        sizes = [ENDS, *values.get(name, []), outputs]
         if sum(a * b for a, b in itertools.pairwise(sizes)) > MOST_WEIGHTS:
             raise ValueError(f"{name} must be of at most {MOST_WEIGHTS:,} weights.")
 

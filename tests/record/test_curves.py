@@ -31,7 +31,7 @@ def log_full_run(logger, num_points=40):
             "eval/cv_rate": 0.03 * (1 - rise) + 0.004 * rng.uniform(),
             "eval/det/cv_rate": 0.025 * (1 - rise) + 0.003 * rng.uniform(),
             "train/cv_rate": 0.05 * (1 - rise) + 0.01 * rng.uniform(),
-            "update/constraint": 2.5 + 2 * (1 - rise) + 0.2 * rng.normal(),
+            "update/cost_level": 2.5 + 2 * (1 - rise) + 0.2 * rng.normal(),
             "update/cost_limit": 2.5,
         }
         for name in ("eval/", "eval/det/"):
@@ -140,7 +140,7 @@ def test_full_run(run, tmp_path, draw):
             "sampled action": "eval/cv_rate",
             "deterministic action": "eval/det/cv_rate",
         },
-        {"estimate": "update/constraint", "limit": "update/cost_limit"},
+        {"estimate": "update/cost_level", "limit": "update/cost_limit"},
     ]
     for panel, names in zip(lines, expected, strict=True):
         assert set(panel) == set(names)
@@ -175,7 +175,7 @@ def test_the_interval_is_shaded(run, tmp_path, draw, monkeypatch):
 
 
 def test_values_that_are_not_numbers_leave_gaps(run, draw):
-    for name in ("eval/score", "eval/score_low", "eval/score_high", "update/constraint"):
+    for name in ("eval/score", "eval/score_low", "eval/score_high", "update/cost_level"):
         for step, value in ((10, math.nan), (20, math.inf if "update" in name else math.nan)):
             run.log_scalar(name, value, step=step)
     _, lines, _ = draw(run_dir(run))
@@ -189,7 +189,7 @@ def test_values_that_are_not_numbers_leave_gaps(run, draw):
         ("eval/score", 0),
         ("eval/det/score", 0),
         ("train/cv_rate", 1),
-        ("update/constraint", 2),
+        ("update/cost_level", 2),
         # A limit with no estimate to compare it with is nothing to look at.
         ("update/cost_limit", None),
         ("update/kl", None),

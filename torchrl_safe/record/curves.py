@@ -5,6 +5,7 @@ The drawing uses matplotlib's objects, never ``pyplot``: no window, no global st
 
 from __future__ import annotations
 
+import itertools
 import os
 from collections.abc import Mapping
 from pathlib import Path
@@ -24,6 +25,7 @@ Curves = Mapping[str, tuple[np.ndarray, np.ndarray]]
 _LOG_LIMIT = 2**25  # bytes of one metric
 
 # Okabe and Ito's colours, told apart by every kind of colour vision; line styles say it again.
+_LEVEL = "update/cost_level"
 _BLUE, _VERMILLION, _GREY, _BLACK = "#0072B2", "#D55E00", "#999999", "#000000"
 
 
@@ -81,8 +83,8 @@ def plot_learning_curves(run_dir: str | os.PathLike[str], path: str | os.PathLik
 
     The metrics drawn are ``score`` and ``cv_rate`` under ``eval/`` (sampled actions) and
     ``eval/det/`` (deterministic), with the interval ``score_low``, ``score_high`` shaded;
-    ``train/cv_rate``; ``update/constraint`` and ``update/cost_limit``. Those a run has not logged
-    are left out, and a panel with none of its own says so.
+    ``train/cv_rate``; ``update/cost_level`` and ``update/cost_limit``, of several costs each under
+    its name. Those a run has not logged are left out, and a panel with none of its own says so.
 
     Args:
         run_dir (path): as in :func:`read_metrics`.
@@ -122,10 +124,15 @@ def plot_learning_curves(run_dir: str | os.PathLike[str], path: str | os.PathLik
         violations, metrics, "eval/det/cv_rate", "deterministic action", color=_VERMILLION, ls="-."
     )
 
-    constraint.set(title="Constraint estimate", ylabel="discounted cost sum")
-    _draw(constraint, metrics, "update/constraint", "estimate", color=_BLUE)
-    if constraint.lines:
-        _draw(constraint, metrics, "update/cost_limit", "limit", color=_BLACK, ls="--")
+    constraint.set(title="Constraint estimate", ylabel="cost, in the unit of the limit")
+    costs = sorted(n.removeprefix(_LEVEL) for n in metrics if n.startswith(f"{_LEVEL}/")) or [""]
+    for cost, colour in zip(costs, itertools.cycle((_BLUE, _VERMILLION, _GREY)), strict=False):
+        name = f" of {cost[1:]}" if cost else ""
+        if f"{_LEVEL}{cost}" in metrics:
+            _draw(constraint, metrics, _LEVEL + cost, f"estimate{name}", color=colour)
+            black = colour if name else _BLACK
+            limit = f"update/cost_limit{cost}"
+            _draw(constraint, metrics, limit, f"limit{name}", color=black, ls="--")
 
     for axes in (score, violations, constraint):
         axes.set_xlabel("environment steps")

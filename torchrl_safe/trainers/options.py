@@ -67,13 +67,20 @@ def option(
     return Field(default, description=meaning, json_schema_extra=extra, **bounds)
 
 
-def again(group: type[Group], name: str, default: Any, *, fixed: bool | None = None) -> Any:
+def again(
+    group: type[Group],
+    name: str,
+    default: Any,
+    *,
+    meaning: str | None = None,
+    fixed: bool | None = None,
+) -> Any:
     """The option ``name`` of a group, with another default: for a class derived from it."""
     field = group.model_fields[name]
     extra: Any = field.json_schema_extra
     return option(
         default,
-        field.description or "",
+        meaning or field.description or "",
         choices=extra["choices"],
         allowed=extra["allowed"],
         fixed=extra["fixed"] if fixed is None else fixed,
@@ -231,6 +238,8 @@ class ConstrainedLoss(Loss):
         "of cost_limit: the discounted sum, the mean per step, or the sum of an episode of "
         "eval.num_steps",
     )
+    initial_ratio: ClassVar[float] = 1.0
+
     initial_cost_limit: float | dict[str, float] | None = option(
         None,
         "moves linearly to cost_limit; null is cost_limit itself",
@@ -368,6 +377,16 @@ class Options(Group):
                 raise ValueError(f"{full} is given twice.")
             values[full] = value
         return cls(**_nested(values))
+
+    def changed(self, **named: Any) -> Self:
+        """These options with others in their place, by name as in :meth:`of`.
+
+        Raises:
+            ValueError: if there is no such option or several, or a value is impossible.
+        """
+        values = dict(flat(self))
+        kept = {name: values[name] for name in given(self)}
+        return type(self).of(**kept | {self._full_name(n): value for n, value in named.items()})
 
     @classmethod
     def _full_name(cls, name: str) -> str:

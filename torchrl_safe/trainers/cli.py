@@ -1,0 +1,112 @@
+"""``torchrl-safe train METHOD``: a method with options of the command line, by hydra's grammar."""
+
+from __future__ import annotations
+
+import re
+import sys
+from collections.abc import Sequence
+from typing import Any
+
+import hydra
+from hydra.core.config_store import ConfigStore
+from hydra.core.hydra_config import HydraConfig
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from omegaconf import DictConfig, OmegaConf
+
+from torchrl_safe.trainers.methods import METHODS
+from torchrl_safe.trainers.options import MethodOptions, flat
+
+# Hydra itself writes no folder and no log: run_dir has everything.
+HYDRA = {
+    "output_subdir": None,
+    "run": {"dir": "."},
+    "sweep": {  # it insists on a folder for its own record of a sweep
+        "dir": "${oc.env:TMPDIR,${oc.env:TEMP,/tmp}}/hydra-${oc.env:USER,${oc.env:USERNAME,user}}",
+        "subdir": ".",
+    },
+}
+
+
+def train(method: str, arguments: Sequence[str] | None = None, **defaults: Any) -> None:
+    """Train a method as hydra's arguments say: ``a.b=c``, ``--multirun``, ``--cfg job``.
+
+    Args:
+        method (str): a name in ``METHODS``.
+        arguments (sequence of str, optional): defaults to the process's.
+        **defaults: other defaults of options of the top level.
+    """
+    name = register(method, **defaults)
+
+    def main(cfg: DictConfig) -> None:
+        METHODS[method](options=options_of(method, cfg, **defaults)).train()
+
+    arguments = sys.argv[1:] if arguments is None else arguments
+    before, sys.argv = sys.argv, [sys.argv[0], *map(spelled_out, arguments)]
+    try:
+        hydra.main(config_path=None, config_name=name, version_base="1.3")(main)()
+    finally:
+        sys.argv = before
+
+
+def compose(method: str, overrides: Sequence[str] = (), **defaults: Any) -> MethodOptions:
+    """The options of a method with overrides as on the command line."""
+    overrides = [*map(spelled_out, overrides)]
+    name = register(method, **defaults)
+    with hydra.initialize(config_path=None, version_base="1.3"):
+        cfg = hydra.compose(name, overrides)
+    return options_of(method, cfg, overrides, **defaults)
+
+
+def register(method: str, **defaults: Any) -> str:
+    """Give hydra the defaults of a method; the name that it knows them by."""
+    settings = METHODS[method].Options().model_dump() | defaults
+    defaults_list = [
+        "_self_",
+        {"override hydra/job_logging": "none"},
+        {"override hydra/hydra_logging": "none"},
+    ]
+    ConfigStore.instance().store(method, {**settings, "hydra": HYDRA, "defaults": defaults_list})
+    return method
+
+
+def options_of(
+    method: str, cfg: DictConfig, overrides: Sequence[str] | None = None, **defaults: Any
+) -> MethodOptions:
+    """Options of what hydra composed.
+
+    Given are those that an override names, and those that differ from the defaults: a caller who
+    composes a configuration leaves no other trace.
+    """
+    if overrides is None:
+        overrides = list(HydraConfig.get().overrides.task) if HydraConfig.initialized() else []
+    words = OverridesParser.create().parse_overrides(list(overrides))
+    keys = [word.key_or_group for word in words]
+    values: Any = OmegaConf.to_container(cfg, resolve=True)
+    standard = dict(flat(METHODS[method].Options()))
+
+    def named(name: str) -> bool:
+        return any(name == key or name.startswith(f"{key}.") for key in keys)
+
+    given = {
+        name: value
+        for name, value in _leaves(values, standard)
+        if named(name) or name not in standard or standard[name] != value
+    }
+    return METHODS[method].Options.of(**given)
+
+
+def spelled_out(argument: str) -> str:
+    """``env=gym`` is short for ``env.name=gym``."""
+    return re.sub(r"^(\+*)env=(?!\{)", r"\1env.name=", argument)
+
+
+def _leaves(values: Any, standard: Any, prefix: str = "") -> list[tuple[str, Any]]:
+    """Options by their dotted names; an option's own mapping stays whole."""
+    leaves: list[tuple[str, Any]] = []
+    for name, value in values.items():
+        full = prefix + str(name)
+        if isinstance(value, dict) and full not in standard:
+            leaves += _leaves(value, standard, f"{full}.")
+        else:
+            leaves.append((full, value))
+    return leaves

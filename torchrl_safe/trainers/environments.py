@@ -1,0 +1,283 @@
+"""The environments of a run, by ``env.name`` or as somebody hands them over."""
+
+from __future__ import annotations
+
+import copy
+import inspect
+from collections.abc import Callable, Sequence
+from importlib import import_module
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from torchrl.data import Binary, Composite, TensorSpec
+from torchrl.envs import (
+    CatTensors,
+    DoubleToFloat,
+    EnvBase,
+    SerialEnv,
+    StepCounter,
+    Transform,
+    TransformedEnv,
+)
+from torchrl.envs.batched_envs import BatchedEnvBase
+
+from torchrl_safe.envs import RANDOMIZATIONS
+from torchrl_safe.trainers.options import MethodOptions
+
+MakeEnv = Callable[..., EnvBase]
+NOT_INPUTS = ("violation", "violations", "goal_met", "diverged", "step_count")
+
+
+class UntrustedError(ValueError):
+    """A configuration names code that nobody here has agreed to run."""
+
+
+def make_env(
+    options: MethodOptions,
+    num_envs: int,
+    seed: int,
+    *,
+    training: bool = False,
+    source: MakeEnv | None = None,
+    trust: bool = True,
+    **of_robots: Any,
+) -> EnvBase:
+    """A batch of environments, ``[num_envs]``.
+
+    They have a float32 ``"observation"`` (or what the networks read), a reward, a cost beside it in
+    the reward spec, and a ``"violation"``: where one that is not ours has none, a step violates if
+    it costs.
+
+    Args:
+        options (MethodOptions): ``env.name`` says which, ``env`` how.
+        num_envs (int): how many.
+        seed (int): of their layouts and initial states.
+
+    Keyword Args:
+        training (bool): whether they are to train in: with ``env.episode_length``, staggered and
+            randomized where they can be. Defaults to False.
+        source (callable, optional): makes them, in place of ``env.name``, from the keywords
+            ``num_envs`` and ``seed`` if it has them. One environment without a batch is taken
+            ``num_envs`` times.
+        trust (bool): whether functions that the options name may be imported. Defaults to True;
+            false for options that come with somebody's files.
+        **of_robots: of the constructor, where ``env.name`` is ``robot``.
+
+    Raises:
+        UntrustedError: if ``trust`` is false and the options name code.
+        ValueError: if there is no such environment, or it has no cost.
+    """
+    name, device = options.env.name, options.device
+    if source is None and not trust and (code := names_code(options)) is not None:
+        raise UntrustedError(
+            f"the configuration names code, {code}: pass the environment itself, or say that you "
+            "trust it."
+        )
+    if source is not None:
+        return _completed(_batched(source, num_envs, seed), options)
+    if name == "robot":
+        from torchrl_safe.envs import SafeGoalEnv
+
+        if training:
+            of_robots = {
+                "episode_length": options.env.episode_length,
+                "stagger": True,
+                "randomization": RANDOMIZATIONS.get(options.env.randomization or ""),
+                **of_robots,
+            }
+        return SafeGoalEnv(
+            options.env.robot,
+            num_envs=num_envs,
+            num_threads=options.num_threads,
+            seed=seed,
+            device=device,
+            **of_robots,
+        )
+    if name == "python":
+        raise ValueError("the run's environment was made in Python: pass it as env.")
+    if options.env.id is None and name in ("velocity", "gym"):
+        raise ValueError(f"env.id must name an environment for env={name}, got null.")
+    if name == "velocity":
+        from torchrl_safe.envs import SafeVelocityEnv
+
+        how = {"episode_length": options.env.episode_length, "stagger": True} if training else {}
+        return SafeVelocityEnv(
+            options.env.id,
+            num_envs=num_envs,
+            num_threads=options.num_threads,
+            seed=seed,
+            device=device,
+            **how,
+        )
+    if name == "gym":
+        env = _batched(lambda: _make_gym(options), num_envs, seed)
+        if training:
+            env = TransformedEnv(env, StepCounter(max_steps=options.env.episode_length))
+        return _completed(env, options)
+    return _completed(_batched(imported("env.name", name), num_envs, seed), options)
+
+
+def names_code(options: MethodOptions) -> str | None:
+    """What of the environment's options would be imported, if anything."""
+    return next(
+        (
+            f"env.{name}={value}"
+            for name in ("name", "id", "cost")
+            if (value := getattr(options.env, name)) is not None and ":" in value
+        ),
+        None,
+    )
+
+
+def imported(option: str, name: str) -> Callable[..., Any]:
+    """The function ``module:function``.
+
+    Raises:
+        ValueError: if the name is none of that form, or there is no such function.
+    """
+    module, colon, function = name.partition(":")
+    if not colon:
+        raise ValueError(
+            f"{option} must be one of 'robot', 'gym', 'velocity', or module:function, got {name!r}."
+            if option == "env.name"
+            else f"{option} must be module:function, got {name!r}."
+        )
+    try:
+        found = getattr(import_module(module), function, None)
+    except ModuleNotFoundError as error:
+        raise ValueError(f"{option}={name} cannot be imported: {error}.") from error
+    if not callable(found):
+        raise ValueError(f"{option}={name} must be a function, {module} has none of this name.")
+    return found
+
+
+def has_state(env: EnvBase) -> bool:
+    """Whether an environment's ``state_dict`` is all that its future depends on: of ours it is."""
+    return hasattr(env, "_core")
+
+
+def source_of(env: EnvBase | MakeEnv) -> tuple[MakeEnv, int | None]:
+    """What makes environments like the given one, and how many it is of if that is settled.
+
+    Raises:
+        TypeError: if it is neither an environment nor a function.
+        ValueError: if the environment cannot be made again.
+    """
+    if not isinstance(env, EnvBase):
+        if not callable(env):
+            raise TypeError(
+                "env must be a robot's name, a TorchRL environment or a function that makes one, "
+                f"got {type(env).__name__}."
+            )
+        return env, None
+    if isinstance(env, BatchedEnvBase):
+        kind, creators, kwargs = type(env), env.create_env_fn, env.create_env_kwargs
+
+        def again() -> EnvBase:
+            return kind(len(creators), creators, create_env_kwargs=kwargs)
+
+        return again, env.batch_size.numel()
+    try:
+        pristine = copy.deepcopy(env)
+    except Exception as error:
+        raise ValueError(
+            f"{type(env).__name__} cannot be copied, and a run needs several of them, for training "
+            "and evaluation: pass a function that makes one, of num_envs and seed."
+        ) from error
+    return lambda: copy.deepcopy(pristine), env.batch_size.numel() if env.batch_size else None
+
+
+def _make_gym(options: MethodOptions) -> EnvBase:
+    from torchrl.envs import GymEnv
+
+    from torchrl_safe.envs.transforms import CostFunction
+
+    env = GymEnv(options.env.id, device=options.device)
+    if options.env.cost is None:
+        return env
+    return TransformedEnv(env, CostFunction(imported("env.cost", options.env.cost)))
+
+
+def _batched(make: MakeEnv, num_envs: int, seed: int) -> EnvBase:
+    """``num_envs`` environments of a function that makes one, or as many as it is asked for."""
+    takes = inspect.signature(make).parameters
+    if "num_envs" in takes:
+        how = {"num_envs": num_envs} | ({"seed": seed} if "seed" in takes else {})
+        env = make(**how)
+    else:
+        env = make()
+        if not env.batch_size:
+            env.close()
+            env = SerialEnv(num_envs, make)
+    if "seed" not in takes or "num_envs" not in takes:
+        env.set_seed(seed % 2**31)
+    if len(env.batch_size) != 1:
+        raise ValueError(
+            f"env must have a batch of one dimension or none, got {tuple(env.batch_size)}."
+        )
+    return env
+
+
+def _completed(env: EnvBase, options: MethodOptions) -> EnvBase:
+    """With all entries that training, evaluation and plots read."""
+    costs = cost_names(options)
+    rewards = list(env.full_reward_spec.keys(True, True))
+    if missing := [name for name in costs if name not in rewards]:
+        raise ValueError(
+            f"the environment must have a cost {missing[0]!r} beside the reward in its reward "
+            f"spec, which has {rewards}. loss.cost_limit names others: {{name: limit}}."
+        )
+    observations = env.full_observation_spec
+    doubles = [key for key, spec in _leaves(observations) if spec.dtype == torch.float64]
+    doubles += [key for key in rewards if env.full_reward_spec[key].dtype == torch.float64]
+    if doubles:
+        env = TransformedEnv(env, DoubleToFloat(in_keys=doubles))
+    vectors = [
+        key
+        for key, spec in _leaves(observations)
+        if spec.dtype.is_floating_point
+        and spec.ndim == 1 + len(env.batch_size)
+        and key not in NOT_INPUTS
+    ]
+    if "observation" not in observations.keys() and vectors:
+        together = CatTensors(in_keys=vectors, out_key="observation", del_keys=False)
+        env = TransformedEnv(env, together)
+    if "violation" not in observations.keys():
+        env = TransformedEnv(env, _ViolationOfCosts(costs))
+    return env
+
+
+def cost_names(options: MethodOptions) -> list[str]:
+    """The costs that are limited; without limits, ``"cost"``."""
+    limit = getattr(options.loss, "cost_limit", None)  # type: ignore[attr-defined]
+    return list(limit) if isinstance(limit, dict) else ["cost"]
+
+
+def _leaves(spec: Composite) -> Sequence[tuple[Any, TensorSpec]]:
+    return list(spec.items(True, True))
+
+
+class _ViolationOfCosts(Transform):
+    """A step that costs violates, where the environment does not say it."""
+
+    def __init__(self, costs: list[str]) -> None:
+        super().__init__(in_keys=costs, out_keys=["violation"])
+
+    def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
+        costs = torch.stack([next_tensordict[key] for key in self.in_keys])
+        return next_tensordict.set("violation", (costs > 0).any(0))
+
+    def _reset(
+        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
+    ) -> TensorDictBase:
+        shape = (*tensordict_reset.batch_size, 1)
+        no = torch.zeros(shape, dtype=torch.bool, device=tensordict_reset.device)
+        return tensordict_reset.set("violation", no)
+
+    def transform_observation_spec(self, observation_spec: Composite) -> Composite:
+        shape = (*observation_spec.shape, 1)
+        observation_spec["violation"] = Binary(
+            1, shape=shape, dtype=torch.bool, device=observation_spec.device
+        )
+        return observation_spec

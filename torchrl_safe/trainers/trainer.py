@@ -1,0 +1,406 @@
+"""What all methods are: networks and losses to build, an update, and the loop around it."""
+
+from __future__ import annotations
+
+import os
+import re
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from functools import partial
+from pathlib import Path
+from typing import Any, ClassVar
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import ProbabilisticTensorDictSequential
+from torch import nn
+from torchrl._utils import logger as torchrl_logger
+from torchrl._utils import timeit
+from torchrl.checkpoint import CheckpointError
+from torchrl.collectors import BaseCollector
+from torchrl.envs import EnvBase
+
+from torchrl_safe._files import printable
+from torchrl_safe.envs import ROBOTS
+from torchrl_safe.optim.trust_region import TrustRegionReport
+from torchrl_safe.record import batch_metrics, count_violations
+from torchrl_safe.trainers.checkpoints import load_components
+from torchrl_safe.trainers.collectors import WorkerDied, make_collector
+from torchrl_safe.trainers.environments import cost_names, has_state, make_env, source_of
+from torchrl_safe.trainers.networks import MakeNetwork, is_discrete, make_critic, make_policy
+from torchrl_safe.trainers.options import ConstrainedLoss, MethodOptions
+from torchrl_safe.trainers.run import Run
+from torchrl_safe.trainers.saved import from_newest
+from torchrl_safe.trainers.streams import stream_seed
+from torchrl_safe.trainers.terminal import GracefulStop, progress_bar, say
+
+
+class Trainer(ABC):
+    """A method. It says what it is made of in :meth:`build`, and what it does in :meth:`update`.
+
+    Args:
+        env (str, EnvBase or callable, optional): what to train in: the name of a robot of ours, a
+            TorchRL environment with a cost in its reward spec, or a function that makes one, from
+            the keywords ``num_envs`` and ``seed`` if it has them. By default what the options say.
+
+    Keyword Args:
+        in_keys (sequence of str): what the networks read. Defaults to ``"observation"``, which
+            several vectors are concatenated to where an environment has no such entry.
+        network (callable, optional): makes the networks of policy and critics from the specs of
+            their inputs and the number of outputs, as images need. Defaults to an MLP.
+        options (MethodOptions, optional): of :attr:`Options`.
+        **named: options by name: dotted, or the last part where only one option has it.
+
+    Raises:
+        ValueError: if an option is unknown or its value impossible, or the method cannot have the
+            environment's actions.
+        TypeError: if ``env`` is something else.
+    """
+
+    Options: ClassVar[type[MethodOptions]]
+    discrete: ClassVar[bool] = False  # whether it can have discrete actions
+
+    policy: ProbabilisticTensorDictSequential
+
+    def __init__(
+        self,
+        env: str | EnvBase | Callable[..., EnvBase] | None = None,
+        *,
+        in_keys: Sequence[str] = ("observation",),
+        network: MakeNetwork | None = None,
+        options: MethodOptions | None = None,
+        **named: Any,
+    ) -> None:
+        self.source: Callable[..., EnvBase] | None = None
+        if isinstance(env, str):
+            if env not in ROBOTS:
+                raise ValueError(
+                    f"env must be a TorchRL environment, a function that makes one or one of "
+                    f"{', '.join(map(repr, ROBOTS))}, got {env!r}."
+                )
+            named["env.robot"] = env
+        elif env is not None:
+            self.source, width = source_of(env)
+            named.setdefault("env.name", "python")
+            if width is not None:
+                for name in ("env.num_envs", "eval.num_episodes", "eval.final_episodes"):
+                    named[name] = width
+        options = self.Options() if options is None else options
+        self.options: Any = options.changed(**named)
+        self.in_keys = list(in_keys)
+        self.network = network
+        self.run: Run | None = None
+
+    @abstractmethod
+    def build(self, env: EnvBase) -> dict[str, Any]:
+        """Make the networks, losses and optimizers of an environment, :attr:`policy` among them.
+
+        Returns:
+            dict: what a checkpoint keeps besides the policy, by name.
+        """
+
+    @abstractmethod
+    def update(self, batch: TensorDictBase) -> dict[str, float]:
+        """The method's step on a new batch ``[N, T]``.
+
+        Returns:
+            dict: metrics to log.
+        """
+
+    @property
+    def frames(self) -> int:
+        """Frames collected so far."""
+        return 0 if self.run is None else self.run.frames
+
+    def make_env(self, num_envs: int, seed: int, **how: Any) -> EnvBase:
+        """A batch of the environments, see :func:`~torchrl_safe.trainers.environments.make_env`."""
+        return make_env(self.options, num_envs, seed, source=self.source, **how)
+
+    def make_policy(self, env: EnvBase) -> Any:
+        """A policy of the environment's actions.
+
+        Raises:
+            ValueError: if the actions are discrete and the method needs others.
+        """
+        if is_discrete(env) and not self.discrete:
+            raise ValueError(
+                f"{type(self).__name__} needs continuous actions, because it differentiates "
+                f"through them; the environment's are {type(env.action_spec).__name__}."
+            )
+        return make_policy(self.options, env, in_keys=self.in_keys, network=self.network)
+
+    def make_critic(
+        self, env: EnvBase, out_key: str, *last: nn.Module, of_actions: bool = True
+    ) -> Any:
+        """A critic, see :func:`~torchrl_safe.trainers.networks.make_critic`."""
+        return make_critic(
+            self.options,
+            env,
+            out_key,
+            *last,
+            of_actions=of_actions,
+            in_keys=self.in_keys,
+            network=self.network,
+        )
+
+    def train(self, **named: Any) -> Any:
+        """Train, evaluate and film, in a run's folder.
+
+        Args:
+            **named: options, as of the constructor.
+
+        Returns:
+            The policy.
+
+        Raises:
+            ValueError: if an option is unknown or its value impossible.
+            FileExistsError: if the folder is another process's, or holds a run and ``resume`` is
+                not set.
+            FileNotFoundError: if there is nothing to resume.
+        """
+        with Run(self.options.changed(**named)) as run:
+            self.run, self.options = run, run.options
+            set_up(self.options)
+            eval_env = self.make_env(self.options.eval.num_episodes, stream_seed("evaluation"))
+            run.register(**self.build(eval_env))
+            self._train(run, eval_env)
+            eval_env.close()
+        return self.policy
+
+    def _train(self, run: Run, eval_env: EnvBase) -> None:
+        """Collect, update, log, evaluate and save until the frames are spent; then finish."""
+        options = self.options
+        resumes_inside = options.collector.backend == "single" and has_state(eval_env)
+        if not resumes_inside:
+            run.restore(policy=self.policy)  # nobody keeps a state: a resumed run starts episodes
+        collector = make_collector(
+            options,
+            partial(make_env, options, training=True, source=self.source),
+            self.policy,
+            seed=stream_seed("training", options.seed, run.frames),
+        )
+        with GracefulStop() as stop, closing_down(collector):
+            if resumes_inside:
+                run.restore(policy=self.policy, collector=collector)
+            if run.finished:
+                say(
+                    f"collector.total_frames={options.collector.total_frames} leaves nothing to "
+                    f"do: the run in run_dir={options.run_dir} has {run.frames} frames and its "
+                    "results."
+                )
+                return
+            try:
+                # None is left of a run that was killed in its final evaluation.
+                if run.frames_left:
+                    self._loop(run, collector, eval_env, stop)
+            except WorkerDied:
+                # A signal to the whole group of processes ends the workers, too. Everything learned
+                # is in this process: nothing of it is lost.
+                run.save()
+                if not stop.requested:
+                    raise
+            else:
+                run.save()
+        if stop.requested:
+            say(f"stopped at {run.frames} frames; go on with the same command and resume=true")
+            return
+        final_env = self.make_env(options.eval.final_episodes, stream_seed("final evaluation"))
+        run.finish(final_env, self.policy)
+        final_env.close()
+
+    def _loop(
+        self, run: Run, collector: BaseCollector, eval_env: EnvBase, stop: GracefulStop
+    ) -> None:
+        options = self.options
+        collector.update_policy_weights_()  # workers start with what a checkpoint brought
+        progress = progress_bar(
+            total=options.collector.total_frames, initial=run.frames, unit="frame"
+        )
+        next_eval, next_save = (
+            run.frames // interval * interval + interval
+            for interval in (options.eval.interval, options.checkpoint.interval)
+        )
+        timeit.erase()  # what was timed before is not the run's
+        started = time.perf_counter()
+        for batch in collector:
+            metrics = self._count(run, batch)
+            metrics |= self.update(batch)
+
+            if run.frames >= next_eval:
+                next_eval += options.eval.interval
+                with timeit("time/eval"):
+                    metrics |= run.evaluate(eval_env, self.policy)
+                run.plot()
+            seconds = time.perf_counter() - started
+            started += seconds
+            run.counters["seconds"] += seconds
+            metrics |= timeit.todict(percall=False)
+            metrics["time/frames_per_second"] = batch.numel() / seconds
+            timeit.erase()
+            run.log(metrics)
+            progress.update(batch.numel())
+            progress.set_postfix(
+                reward=f"{metrics['train/reward_per_1000']:.1f}",
+                cost=f"{metrics['train/cost_rate']:.3f}",
+                cv=f"{metrics['train/cv_rate']:.4f}",
+                kl=f"{metrics.get('update/kl', 0.0):.4f}",
+            )
+            if run.frames >= next_save:
+                next_save += options.checkpoint.interval
+                run.save()
+            if stop.requested or not run.frames_left:
+                break
+            # After the log: where a worker has died meanwhile, the update is saved and logged.
+            collector.update_policy_weights_()
+        progress.close()
+
+    def _count(self, run: Run, batch: TensorDictBase) -> dict[str, float]:
+        """What a batch adds to the counters, and is by itself."""
+        run.counters["frames"] += batch.numel()
+        run.counters["total_cvs"] += count_violations(batch)
+        diverged = batch.get(("next", "diverged"), None)
+        run.counters["instabilities"] += 0 if diverged is None else int(diverged.sum())
+        return {
+            **batch_metrics(batch),
+            "train/total_cvs": run.counters["total_cvs"],
+            "train/instabilities": run.counters["instabilities"],
+            "train/entropy": -batch["action_log_prob"].mean().item(),
+        }
+
+
+class ConstrainedTrainer(Trainer):
+    """A method under limits on one or several costs.
+
+    Limits are in ``loss.limit_unit`` for whoever reads the log, and on the discounted sum of the
+    cost for the losses: a mean of ``c`` per step is a discounted sum of ``c / (1 - cost_gamma)``.
+    """
+
+    @property
+    def costs(self) -> list[str]:
+        """Names of the costs that are limited."""
+        return cost_names(self.options)
+
+    def limits(self) -> dict[str, float]:
+        """The limits of now on the discounted sums, by cost."""
+        loss, scale = self.options.loss, discounted_unit(self.options)
+        return {name: scale * limit_at(loss, name, self.frames) for name in self.costs}
+
+    def levels(self, levels: Mapping[str, float]) -> dict[str, float]:
+        """Metrics of how high costs stand, and of the limits of now, in ``loss.limit_unit``.
+
+        Args:
+            levels (mapping): discounted sums, by cost.
+        """
+        scale = discounted_unit(self.options)
+        return {
+            **self.named("update/cost_level", {n: value / scale for n, value in levels.items()}),
+            **self.named("update/cost_limit", {n: x / scale for n, x in self.limits().items()}),
+        }
+
+    def report(self, report: TrustRegionReport, limits: Mapping[str, float]) -> dict[str, float]:
+        """Metrics of a trust region's step: its constraints as levels of the costs."""
+        numbers = report.to_dict()
+        levels = {
+            name: over + limit
+            for over, (name, limit) in zip(report.constraint, limits.items(), strict=True)
+        }
+        excess = re.compile(r"update/constraint(_\d+)?")
+        plain = {n: x for n, x in numbers.items() if not excess.fullmatch(n)}
+        return {**plain, **self.levels(levels)}
+
+    def named(self, metric: str, values: Mapping[str, float]) -> dict[str, float]:
+        """A metric of every cost: under its plain name if there is one cost."""
+        return {self.name_of(metric, cost): float(value) for cost, value in values.items()}
+
+    def name_of(self, name: str, cost: str) -> str:
+        """The name of something that each cost has, told apart where there are several."""
+        return name if len(self.costs) == 1 else f"{name}/{cost}"
+
+
+def limit_at(loss: ConstrainedLoss, cost: str, frames: int) -> float:
+    """The limit after ``frames``: it moves, so that an agent learns to drive before it must avoid.
+
+    Args:
+        loss (ConstrainedLoss): ``cost_limit``, where it starts and when it is there.
+        cost (str): the name of the cost.
+        frames (int): so far.
+
+    Returns:
+        float: in ``loss.limit_unit``.
+    """
+    final, initial = (
+        value.get(cost) if isinstance(value, dict) else value
+        for value in (loss.cost_limit, loss.initial_cost_limit)
+    )
+    if final is None:
+        raise ValueError(f"loss.cost_limit must have a limit on {cost!r}, got {loss.cost_limit}.")
+    initial = loss.initial_ratio * final if initial is None else initial
+    remaining = max(0.0, 1.0 - frames / max(1, loss.anneal_frames))
+    return final + remaining * (initial - final)
+
+
+def discounted_unit(options: Any) -> float:
+    """The discounted sum of a cost that is 1 in ``loss.limit_unit``."""
+    loss = options.loss
+    if loss.limit_unit == "discounted":
+        return 1.0
+    steps = options.eval.num_steps if loss.limit_unit == "episode" else 1
+    return 1.0 / (steps * (1.0 - loss.cost_gamma))
+
+
+def set_up(options: MethodOptions) -> None:
+    """Threads, seed, a quiet logger: what comes first."""
+    torchrl_logger.setLevel("WARNING")  # its notes would break the progress bar
+    if "OMP_NUM_THREADS" not in os.environ:
+        torch.set_num_threads(options.num_threads)
+    torch.manual_seed(stream_seed("networks", options.seed))
+
+
+@contextmanager
+def closing_down(collector: BaseCollector) -> Iterator[None]:
+    """However it ends: a process waits for those that it has started before it exits."""
+    try:
+        yield
+    finally:
+        collector.shutdown()
+
+
+def load_policy(run_dir: str | os.PathLike[str], env: Any = None) -> Any:
+    """The policy of a run, as its newest checkpoint has it.
+
+    Nothing is unpickled: weights are read as tensors, everything else as JSON. No code that the
+    configuration names is imported.
+
+    Args:
+        run_dir (path): the run's folder.
+        env (EnvBase or callable, optional): the environment of a run in one that is not ours.
+
+    Raises:
+        FileNotFoundError: if it holds no run, or one without a checkpoint.
+        CheckpointError: if the checkpoint is not what was written, or could run code.
+        UntrustedError: if the environment is somebody's, and ``env`` is not given.
+    """
+    return from_newest(run_dir, partial(saved_policy, env=env))
+
+
+def saved_policy(
+    options: MethodOptions, checkpoint: Path, env: Any = None, *, trust: bool = False
+) -> Any:
+    """The policy of a checkpoint.
+
+    Raises:
+        CheckpointError: if it is not what was written, or not finite.
+        UntrustedError: if ``trust`` is false, the configuration names code and ``env`` is not
+            given.
+    """
+    if not isinstance(options, MethodOptions):
+        raise CheckpointError(f"{printable(checkpoint)} has no mixture policy.")
+    source = None if env is None else source_of(env)[0]
+    policy = make_policy(options, make_env(options, 1, 0, source=source, trust=trust))
+    load_components(checkpoint, policy=policy)
+    for name, weight in policy.named_parameters():
+        if not weight.isfinite().all():
+            raise CheckpointError(f"{name} of the policy in {printable(checkpoint)} is not finite.")
+    return policy.eval().requires_grad_(False)

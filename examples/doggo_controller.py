@@ -27,6 +27,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.modules import MLP, ProbabilisticActor, TanhNormal, ValueOperator
 from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
+from torchrl_safe.trainers.utils import Run, set_up
 from walking import Walking
 
 from torchrl_safe.envs import SafeGoalEnv
@@ -35,7 +36,6 @@ from torchrl_safe.record import format_table
 from torchrl_safe.trainers.collectors import ResumableCollector
 from torchrl_safe.trainers.streams import stream_seed
 from torchrl_safe.trainers.terminal import GracefulStop, progress_bar, say
-from torchrl_safe.trainers.utils import Run, set_up
 
 USED = ["observation", "action", "action_log_prob", "advantage", "value_target"]
 

@@ -19,6 +19,8 @@ import torch
 from omegaconf import DictConfig
 from tensordict import TensorDictBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
+from torchrl_safe.trainers.critics import make_losses
+from torchrl_safe.trainers.utils import make_env, saved_policy
 
 from torchrl_safe import CVaRCostLoss, GMMTanhPolicy
 from torchrl_safe._files import expand, make_folder, printable
@@ -36,11 +38,9 @@ from torchrl_safe.record import (
     summarize,
 )
 from torchrl_safe.trainers.checkpoints import load_components
-from torchrl_safe.trainers.critics import make_losses
 from torchrl_safe.trainers.run import write_results
 from torchrl_safe.trainers.saved import from_newest
 from torchrl_safe.trainers.streams import stream_seed
-from torchrl_safe.trainers.utils import make_env, saved_policy
 
 NUM_FILMED = 9
 SEED = 0  # of layouts that neither training nor its evaluations see, whatever the number

@@ -11,12 +11,12 @@ from pathlib import Path
 
 from omegaconf import DictConfig
 from tensordict import TensorDictBase
+from torchrl_safe.trainers.utils import make_env, saved_policy
 
 from torchrl_safe import GMMTanhPolicy
 from torchrl_safe._files import expand, printable
 from torchrl_safe.modules import export_policy
 from torchrl_safe.trainers.saved import from_newest
-from torchrl_safe.trainers.utils import make_env, saved_policy
 
 
 def load(cfg: DictConfig, checkpoint: Path) -> tuple[GMMTanhPolicy, TensorDictBase]:

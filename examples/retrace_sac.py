@@ -29,11 +29,11 @@ from torchrl.envs import Compose, DoubleToFloat, EnvBase, GymEnv, RewardSum, Tra
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.modules import MLP, ProbabilisticActor, TanhNormal, ValueOperator
 from torchrl.objectives import SACLoss, SoftUpdate
+from torchrl_safe.trainers.config import check_config
+from torchrl_safe.trainers.descent import Descent
 
 from torchrl_safe import RetraceEstimator
 from torchrl_safe._files import write_atomically
-from torchrl_safe.trainers.config import check_config
-from torchrl_safe.trainers.descent import Descent
 from torchrl_safe.trainers.locks import FolderLock
 from torchrl_safe.trainers.streams import stream_seed
 from torchrl_safe.trainers.terminal import progress_bar

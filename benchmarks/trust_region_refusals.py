@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from torchrl.data import Bounded
 
 from torchrl_safe import GMMTanhPolicy, TrustRegionSafeOptimizer
-from torchrl_safe.objectives.functional import moment_matched_kl
+from torchrl_safe.modules import moment_matched_kl
 
 
 def linear(constraints: int, problems: int = 39, size: int = 12) -> int:

@@ -18,7 +18,7 @@ from torchrl.record import CSVLogger
 from torchrl.trainers import LogScalar, OptimizationStepper, Trainer
 
 from torchrl_safe import GMMTanhPolicy, TrustRegionSafeOptimizer
-from torchrl_safe.objectives.functional import moment_matched_kl
+from torchrl_safe.modules import moment_matched_kl
 
 
 def make_env(seed: int) -> EnvBase:

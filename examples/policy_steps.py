@@ -13,8 +13,8 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from torchrl_safe import GMMTanhPolicy, TanhGaussianMixture, TrustRegionSafeOptimizer
+from torchrl_safe.modules import matched_bound_kl, moment_matched_kl
 from torchrl_safe.objectives import LagrangeMultiplier, PIDMultiplier, lagrangian
-from torchrl_safe.objectives.functional import matched_bound_kl, moment_matched_kl
 
 
 def moments(dist: TanhGaussianMixture) -> dict[str, Tensor]:

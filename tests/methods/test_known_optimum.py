@@ -21,6 +21,7 @@ from torchrl_safe import (
     TrustRegionSafeOptimizer,
     TsallisLoss,
 )
+from torchrl_safe.modules import moment_matched_kl
 from torchrl_safe.objectives import (
     CVaRSurrogateLoss,
     LagrangeMultiplier,
@@ -28,7 +29,6 @@ from torchrl_safe.objectives import (
     ReturnSurrogateLoss,
     lagrangian,
 )
-from torchrl_safe.objectives.functional import moment_matched_kl
 
 N = LinearCMDP.num_states
 ONE = {"cost": 1.5}

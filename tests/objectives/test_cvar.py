@@ -827,6 +827,12 @@ class TestLimits:
         loss, data = make_loss(cost_limit=1.0, risk_level=0.5), make_data()
         measured = loss.measure(data, data["action"])
         before = loss.constraint(data, data["action"], measured)
+        for limit in (3.0, 0.1):  # of now: the loss's own stays
+            now = loss.constraint(data, data["action"], measured, cost_limit=limit)
+            torch.testing.assert_close(now, before + 1 - limit)
+        with pytest.raises(ValueError, match=r"cost_limit must be .* at least 0, got -1"):
+            loss.constraint(data, data["action"], measured, cost_limit=-1.0)
+        assert loss.cost_limit == 1.0
         loss.cost_limit = 3
         torch.testing.assert_close(loss.constraint(data, data["action"], measured), before - 2)
         loss.cost_limit = torch.tensor(2.5)

@@ -524,6 +524,10 @@ class TestMeasurement:
         data = make_steps()
         measured, out = loss.measure(data), loss.compute_advantage(data)
         before = loss.constraint(out, data["action_log_prob"], measured)
+        now = loss.constraint(out, data["action_log_prob"], measured, cost_limit=3.0)
+        torch.testing.assert_close(now, before - 2.5)  # of now: the loss's own stays
+        with pytest.raises(ValueError, match=r"cost_limit must be .* at least 0, got -1"):
+            loss.constraint(out, data["action_log_prob"], measured, cost_limit=-1.0)
         loss.cost_limit = 2.0
         torch.testing.assert_close(
             loss.constraint(out, data["action_log_prob"], measured), before - 1.5

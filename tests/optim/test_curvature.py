@@ -2,18 +2,21 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
 import pytest
 import torch
 from tensordict import TensorDict
 from torch import nn
 
+from torchrl_safe.modules import moment_matched_kl
 from torchrl_safe.modules.distributions import TanhGaussianMixture
-from torchrl_safe.objectives.functional import moment_matched_kl
 from torchrl_safe.optim.curvature import (
+    NoStep,
     conjugate_gradient,
     flatten,
     gauss_newton_product,
     hessian_product,
+    natural_gradients,
     unflatten,
 )
 
@@ -248,3 +251,47 @@ def test_conjugate_gradient_goes_on_after_convergence_without_harm():
         found = conjugate_gradient(lambda v, h=h: v @ h, rhs.to(dtype), 300)
         torch.testing.assert_close(found.solution.double(), expected, rtol=rtol, atol=rtol)
         assert not found.negative.any()
+
+
+def test_natural_gradients_are_those_of_a_dense_inverse():
+    torch.manual_seed(0)
+    root, gradients = torch.randn(6, 6).double(), torch.randn(3, 6).double()
+    hessian = root @ root.T
+    natural = natural_gradients(lambda v: v @ hessian, gradients, damping=0.1, iterations=12)
+    expected = torch.linalg.solve(hessian + 0.1 * torch.eye(6).double(), gradients.T).T
+    weights = np.array([1.0, -2.0, 0.5])
+    torch.testing.assert_close(natural.combine(weights), torch.tensor(weights) @ expected)
+    torch.testing.assert_close(torch.tensor(natural.gram), gradients @ expected.T)
+    assert natural.cg_residual < 1e-8
+
+
+@pytest.mark.parametrize("iterations", [1, 2, 3])
+def test_inner_products_are_exact_however_few_the_iterations(iterations):
+    """``g' x`` and ``x' H x`` of what is combined, which is all that a step's model consists of."""
+    torch.manual_seed(1)
+    root, gradients = torch.randn(9, 9).double(), torch.randn(2, 9).double()
+    hessian = root @ root.T
+    natural = natural_gradients(
+        lambda v: v @ hessian, gradients, damping=0.0, iterations=iterations
+    )
+    weights = np.array([0.7, -1.3])
+    step = natural.combine(weights)
+    torch.testing.assert_close(gradients @ step, torch.tensor(natural.gram @ weights))
+    size = torch.tensor(weights @ natural.gram @ weights)
+    torch.testing.assert_close(step @ hessian @ step, size)
+
+
+@pytest.mark.parametrize(
+    ("hessian", "gradient", "reason"),
+    [
+        ([1.0, -1.0], [1.0, 1.0], "not positive definite"),
+        ([1.0, math.nan], [1.0, 1.0], "not finite"),
+        ([1.0, 1.0], [math.inf, 1.0], "not finite"),
+    ],
+)
+def test_no_natural_gradient(hessian, gradient, reason):
+    diagonal = torch.tensor(hessian).diag()
+    with pytest.raises(NoStep, match=reason):
+        natural_gradients(
+            lambda v: v @ diagonal, torch.tensor([gradient]), damping=0.0, iterations=4
+        )

@@ -128,7 +128,7 @@ def test_every_answer_is_safe_and_optimal(count):
 
 
 def test_no_answer_is_worse_than_a_general_solver_s():
-    """Which sees the vectors, knows nothing of faces, and starts from several points."""
+    """Which sees the vectors, knows nothing of active sets, and starts from several points."""
     rng, compared = np.random.default_rng(1), 0
     while compared < 200:
         problem = Problem(rng)

@@ -50,6 +50,7 @@ from torchrl_safe.envs import suite
 from torchrl_safe.modules import (
     DeterministicAction,
     GMMParamExtractor,
+    divergences,
     export_policy,
     mixture_moments,
 )
@@ -261,12 +262,20 @@ for name, moments in {
 }.items():
     bad(
         f"moment_matched_kl: {name}",
-        partial(F.moment_matched_kl, *moments),
+        partial(divergences.moment_matched_kl, *moments),
         ValueError,
         name,
         str(tuple(moments[("old_mean", "old_cov", "new_mean", "new_cov").index(name)].shape)),
         "must have shape (2",
     )
+bad(
+    "categorical_kl: new_logits",
+    lambda: divergences.categorical_kl(zeros(5, 3), zeros(5, 2)),
+    ValueError,
+    "new_logits",
+    "(5, 2)",
+    "must have shape (5, 3)",
+)
 MIXTURE = {
     f"{age}_{name}": torch.ones(shape)
     for age in ("old", "new")
@@ -275,7 +284,7 @@ MIXTURE = {
 for name in (name for name in MIXTURE if name != "old_loc"):
     bad(
         f"matched_bound_kl: {name}",
-        partial(F.matched_bound_kl, **{**MIXTURE, name: zeros(5, 1)}),
+        partial(divergences.matched_bound_kl, **{**MIXTURE, name: zeros(5, 1)}),
         ValueError,
         name,
         "(5, 1)",
@@ -649,14 +658,14 @@ bad(
     "one log-density for the whole action",
 )
 column = zeros(4, 1)
-estimates = {
-    "retrace_lambda_return_estimate": (column, column),
-    "importance_sampling_lambda_return_estimate": (column, column),
-    "tree_backup_lambda_return_estimate": (column,),
-    "q_lambda_return_estimate": (),
+traces = {
+    "retrace": (column, column),
+    "importance_sampling": (column, column),
+    "tree_backup": (column, None),
+    "q_lambda": (None, None),
 }
-for name, densities in estimates.items():
-    function, no = getattr(value, name), column.bool()
+for trace, densities in traces.items():
+    name, no = f"trace_lambda_return_estimate, {trace}", column.bool()
 
     def estimate(
         gamma=0.9,
@@ -665,11 +674,14 @@ for name, densities in estimates.items():
         next_state_value=column,
         done=no,
         time_dim=-2,
-        function=function,
+        trace=trace,
         densities=densities,
     ):
-        values = (action_value, next_state_value, column, done)
-        return function(gamma, lmbda, *densities, *values, time_dim=time_dim)
+        return value.trace_lambda_return_estimate(
+            *(gamma, lmbda, *densities, action_value, next_state_value, column, done),
+            trace=trace,
+            time_dim=time_dim,
+        )
 
     each(name, estimate, "gamma", (-0.1, 1.1, NAN), "in [0, 1]")
     each(name, estimate, "lmbda", (2.0,), "in [0, 1]")
@@ -691,6 +703,23 @@ for name, densities in estimates.items():
         "torch.float32",
         "must be boolean",
     )
+    for i, missing in enumerate(("log_pi", "log_mu")):
+        if densities[i] is not None:
+            bad(
+                f"{name}: without {missing}",
+                partial(estimate, densities=[column] * i + [None] * (2 - i)),
+                ValueError,
+                missing,
+                "got None",
+                f"a tensor for trace={trace!r}",
+            )
+each(
+    "trace_lambda_return_estimate",
+    lambda trace: estimate(trace=trace, densities=(column, column)),
+    "trace",
+    ("v_trace",),
+    "'importance_sampling'",
+)
 for function in (value.retrace_variance_reward, value.squared_td_error):
     name = function.__name__
     each(

@@ -1,4 +1,4 @@
-"""The mixture policy: its distribution and its actor."""
+"""The mixture policy: its distribution, its actor, and distances of policies."""
 
 from torchrl_safe.modules.actors import GMMParamExtractor, GMMTanhPolicy
 from torchrl_safe.modules.distributions import (
@@ -6,14 +6,32 @@ from torchrl_safe.modules.distributions import (
     TanhGaussianMixture,
     mixture_moments,
 )
+from torchrl_safe.modules.divergences import (
+    CATEGORICAL,
+    DISTANCES,
+    MATCHED_BOUND,
+    MOMENT_MATCHED,
+    Distance,
+    categorical_kl,
+    matched_bound_kl,
+    moment_matched_kl,
+)
 from torchrl_safe.modules.export import DeterministicAction, export_policy
 
 __all__ = [
+    "CATEGORICAL",
+    "DISTANCES",
+    "MATCHED_BOUND",
+    "MOMENT_MATCHED",
     "DeterministicAction",
+    "Distance",
     "GMMParamExtractor",
     "GMMTanhPolicy",
     "Relaxation",
     "TanhGaussianMixture",
+    "categorical_kl",
     "export_policy",
+    "matched_bound_kl",
     "mixture_moments",
+    "moment_matched_kl",
 ]

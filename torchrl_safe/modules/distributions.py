@@ -13,14 +13,7 @@ from typing import Literal, get_args
 import torch
 import torch.nn.functional as F
 from torch import Tensor
-from torch.distributions import (
-    Categorical,
-    Distribution,
-    Normal,
-    constraints,
-    kl_divergence,
-    register_kl,
-)
+from torch.distributions import Distribution, constraints
 
 __all__ = ["Relaxation", "TanhGaussianMixture", "mixture_moments"]
 
@@ -386,26 +379,6 @@ class TanhGaussianMixture(Distribution):
         unit = latent.tanh().movedim(0, -1).contiguous()
         center, half_width = (self.high + self.low) / 2, (self.high - self.low) / 2
         return torch.addcmul(center, half_width, unit).clamp(self.low, self.high)
-
-
-@register_kl(TanhGaussianMixture, TanhGaussianMixture)
-def _kl_upper_bound(p: TanhGaussianMixture, q: TanhGaussianMixture) -> Tensor:
-    """KL of component and action together, which is at least that of the action, ``[*B]``."""
-    if p.loc.shape[-2:] != q.loc.shape[-2:]:
-        raise ValueError(
-            "the bound on the KL pairs components, so that both mixtures need the same number of "
-            f"them, got parameters [K, D] of {tuple(p.loc.shape[-2:])} and "
-            f"{tuple(q.loc.shape[-2:])}"
-        )
-    if not (torch.equal(p.low, q.low) and torch.equal(p.high, q.high)):
-        raise ValueError(
-            "the KL is of two policies in one box, got "
-            f"low={p.low.tolist()}, high={p.high.tolist()} and "
-            f"low={q.low.tolist()}, high={q.high.tolist()}"
-        )
-    weights, other = (Categorical(logits=d.logits, validate_args=False) for d in (p, q))
-    parts = kl_divergence(*(Normal(d.loc, d.scale, validate_args=False) for d in (p, q))).sum(-1)
-    return kl_divergence(weights, other) + (weights.probs * parts).sum(-1)
 
 
 def mixture_moments(logits: Tensor, loc: Tensor, scale: Tensor) -> tuple[Tensor, Tensor]:

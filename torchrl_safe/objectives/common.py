@@ -103,6 +103,13 @@ class CostLoss(TrajectoryLoss):
         check_cost_limit(cost_limit)
         self._cost_limit.fill_(cost_limit)  # in place: a compiled step or a graph follows it
 
+    def _limit(self, cost_limit: float | None) -> float | Tensor:
+        """The limit of now: the given one, or the loss's own."""
+        if cost_limit is None:
+            return self.cost_limit
+        check_cost_limit(cost_limit)
+        return cost_limit
+
     @property
     def risk_level(self) -> float:
         """Share of worst outcomes that the CVaR averages; may be assigned at any time."""
@@ -229,7 +236,12 @@ class CriticCostLoss(CostLoss):
         )
 
     def constraint(
-        self, tensordict: TensorDictBase, action: Tensor, measured: MeasuredCVaR
+        self,
+        tensordict: TensorDictBase,
+        action: Tensor,
+        measured: MeasuredCVaR,
+        *,
+        cost_limit: float | None = None,
     ) -> Tensor:
         r"""The constraint, feasible at or below 0, in the unit of ``cost_limit``.
 
@@ -254,12 +266,17 @@ class CriticCostLoss(CostLoss):
             measured (MeasuredCVaR): what :meth:`measure` returned for the policy before its change,
                 with the same states and noise.
 
+        Keyword Args:
+            cost_limit (float, optional): the limit of now, of a schedule or of a
+                :class:`~torchrl_safe.objectives.LimitController`. Defaults to the loss's.
+
         Returns:
             The constraint, a scalar, in units of the discounted cost sum.
 
         Raises:
             TypeError: if ``measured`` is something else.
-            ValueError: if it was measured on another number of states.
+            ValueError: if it was measured on another number of states, or ``cost_limit`` is
+                negative or not finite.
         """
         if not isinstance(measured, MeasuredCVaR):
             raise TypeError(
@@ -272,7 +289,7 @@ class CriticCostLoss(CostLoss):
                 f"reference of shape {tuple(measured.reference.shape)}: hand them to measure, too."
             )
         change = self._mean(value - measured.reference, tensordict)
-        return measured.level + measured.horizon * change - self.cost_limit
+        return measured.level + measured.horizon * change - self._limit(cost_limit)
 
     def _target_dist(self, tensordict: TensorDictBase) -> Distribution:
         with self.target_actor_network_params.to_module(

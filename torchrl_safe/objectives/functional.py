@@ -14,16 +14,24 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from torchrl_safe._deprecation import moved
+
 __all__ = [
     "cvar_factor",
     "discounted_cost_limit",
     "gaussian_cvar",
-    "matched_bound_kl",
-    "moment_matched_kl",
     "q_logarithm",
     "surrogate_change",
     "uniform_tsallis_entropy",
 ]
+
+__getattr__ = moved(
+    __name__,
+    {
+        "matched_bound_kl": "torchrl_safe.modules.divergences.matched_bound_kl",
+        "moment_matched_kl": "torchrl_safe.modules.divergences.moment_matched_kl",
+    },
+)
 
 # exp(10) = 2e4: far above what a density bounded by log_std >= -4 earns where it matters, far
 # below what a float32 gradient overflows at.
@@ -252,162 +260,6 @@ def surrogate_change(
     rise, fall = (torch.where(x, log_ratio, 0) for x in (log_ratio > 0, ~(log_ratio > 0)))
     moved = log_weight.exp() * fall.expm1() - (log_weight + rise).exp() * (-rise).expm1()
     return (moved * (advantage - baseline)).sum() / mask.sum().clamp(min=1) / (1 - gamma)
-
-
-def matched_bound_kl(
-    old_logits: Tensor,
-    old_loc: Tensor,
-    old_scale: Tensor,
-    new_logits: Tensor,
-    new_loc: Tensor,
-    new_scale: Tensor,
-) -> Tensor:
-    r"""Upper bound of the KL divergence between two mixtures of diagonal Gaussians.
-
-    .. math::
-
-        \text{KL}(p \,\|\, p') \le \sum_k w_k \Big(\log \frac{w_k}{w'_k}
-        + \text{KL}(\mathcal N_k \,\|\, \mathcal N'_k)\Big),
-
-    the KL of component and value together (the matched bound of Hershey and Olsen 2007). For
-    single Gaussians it is exact. A trust region that only sees the moments
-    (:func:`moment_matched_kl`) lets components move at will as long as their moments stay; this one
-    holds each of them. Squashing changes neither side: the KL is that of the actions.
-
-    Args:
-        old_logits (Tensor): unnormalized log-weights, ``[*B, K]``.
-        old_loc (Tensor): means, ``[*B, K, D]``.
-        old_scale (Tensor): standard deviations, ``[*B, K, D]``.
-        new_logits (Tensor): ``[*B, K]``.
-        new_loc (Tensor): ``[*B, K, D]``.
-        new_scale (Tensor): ``[*B, K, D]``.
-
-    Returns:
-        The bound on ``KL(old || new)`` in nats, ``[*B]``; float32 for half types.
-
-    Raises:
-        ValueError: if shapes disagree.
-
-    Examples:
-        >>> import torch
-        >>> from torchrl_safe.objectives.functional import matched_bound_kl
-        >>> logits, loc, scale = torch.zeros(2), torch.tensor([[1.0], [-1.0]]), torch.ones(2, 1)
-        >>> matched_bound_kl(logits, loc, scale, logits, loc + 1.0, scale)
-        tensor(0.5000)
-        >>> matched_bound_kl(logits, loc, scale, logits, -loc, scale)  # moments are the same
-        tensor(2.)
-    """
-    shape = tuple(old_loc.shape)
-    _check_shapes(
-        ("old_logits", old_logits, shape[:-1]),
-        ("old_scale", old_scale, shape),
-        ("new_logits", new_logits, shape[:-1]),
-        ("new_loc", new_loc, shape),
-        ("new_scale", new_scale, shape),
-        because=f"old_loc's {shape}",
-    )
-    old_logits, old_loc, old_scale, new_logits, new_loc, new_scale = _at_least_float32(
-        old_logits, old_loc, old_scale, new_logits, new_loc, new_scale
-    )
-    # Written in what changes, which is small for a small KL, so that nothing cancels.
-    change = (old_scale - new_scale) / new_scale
-    shift = (new_loc - old_loc) / new_scale
-    component = 0.5 * (change.square() + shift.square()) + change - change.log1p()
-    log_weight, new_log_weight = old_logits.log_softmax(-1), new_logits.log_softmax(-1)
-    weight, gap = log_weight.exp(), new_log_weight - log_weight
-    # w' - w, which sums to zero; the first form cancels where they are close, the second overflows.
-    tilt = torch.where(gap > 1, new_log_weight.exp() - weight, weight * gap.clamp(max=1).expm1())
-    return (tilt + weight * (component.sum(-1) - gap)).sum(-1)
-
-
-def moment_matched_kl(
-    old_mean: Tensor, old_cov: Tensor, new_mean: Tensor, new_cov: Tensor
-) -> Tensor:
-    """KL divergence between two Gaussians, the trust region's distance of mixtures (15).
-
-    Given the moments of two mixtures it is the moment-matching approximation of Hershey and
-    Olsen (2007); for single Gaussians it is exact.
-
-    Args:
-        old_mean (Tensor): ``[*B, D]``.
-        old_cov (Tensor): full covariance, ``[*B, D, D]``.
-        new_mean (Tensor): ``[*B, D]``.
-        new_cov (Tensor): ``[*B, D, D]``.
-
-    Returns:
-        ``KL(old || new)`` in nats, ``[*B]``; float32 for half types.
-
-    Raises:
-        ValueError: if shapes disagree.
-
-    Examples:
-        >>> import torch
-        >>> from torchrl_safe.objectives.functional import moment_matched_kl
-        >>> mean, cov = torch.zeros(2), torch.eye(2)
-        >>> moment_matched_kl(mean, cov, mean + 1.0, cov)
-        tensor(1.)
-    """
-    mean_shape = tuple(old_mean.shape)
-    cov_shape = (*mean_shape, *mean_shape[-1:])
-    _check_shapes(
-        ("old_cov", old_cov, cov_shape),
-        ("new_mean", new_mean, mean_shape),
-        ("new_cov", new_cov, cov_shape),
-        because=f"old_mean's {mean_shape}",
-    )
-    old_mean, old_cov, new_mean, new_cov = _at_least_float32(old_mean, old_cov, new_mean, new_cov)
-    new_factor, old_factor = _cholesky(new_cov), _cholesky(old_cov)
-    dim = range(old_mean.shape[-1])
-    zero = torch.zeros_like(old_mean[..., 0])
-    # With E = L'^-1 (L - L'), which is small for a small KL, nothing cancels in
-    # KL = (|E|^2 + |L'^-1 (m' - m)|^2) / 2 + sum_i E_ii - log(1 + E_ii).
-    columns = [[old_factor[i][j] - new_factor[i][j] if j <= i else zero for i in dim] for j in dim]
-    shift = list((new_mean - old_mean).unbind(-1))
-    solved = [_solve_lower(new_factor, b) for b in (*columns, shift)]
-    squares = torch.stack([x.square() for column in solved for x in column]).sum(0)
-    diagonal = torch.stack([solved[i][i] for i in dim])
-    return 0.5 * squares + (diagonal - diagonal.log1p()).sum(0)
-
-
-def _at_least_float32(*tensors: Tensor) -> tuple[Tensor, ...]:
-    """Half types, which autocast makes, tell apart no KL of the size of a trust region."""
-    return tuple(x.float() if torch.finfo(x.dtype).bits < 32 else x for x in tensors)
-
-
-def _check_shapes(*expected: tuple[str, Tensor, tuple[int, ...]], because: str) -> None:
-    for name, tensor, shape in expected:
-        if tensor.shape != shape:
-            raise ValueError(
-                f"{name} must have shape {shape}, as {because} says, got {tuple(tensor.shape)}."
-            )
-
-
-# Action spaces are small and batches large: unrolled over the action dimensions, products with
-# the Hessian of the KL are ten times as fast as through batched LAPACK calls.
-
-
-def _cholesky(cov: Tensor) -> list[list[Tensor]]:
-    """Lower factor of ``[*B, D, D]``, as rows of entries ``[*B]``."""
-    factor: list[list[Tensor]] = []
-    for i in range(cov.shape[-1]):
-        row: list[Tensor] = []
-        for j in range(i + 1):
-            entry = cov[..., i, j]
-            for k in range(j):
-                entry = entry - row[k] * (row[k] if i == j else factor[j][k])
-            row.append(entry.sqrt() if i == j else entry / factor[j][j])
-        factor.append(row)
-    return factor
-
-
-def _solve_lower(factor: list[list[Tensor]], b: list[Tensor]) -> list[Tensor]:
-    """Forward substitution."""
-    x: list[Tensor] = []
-    for row, entry in zip(factor, b, strict=True):
-        for coefficient, known in zip(row, x, strict=False):
-            entry = entry - coefficient * known
-        x.append(entry / row[-1])
-    return x
 
 
 def check_count(name: str, value: int) -> None:

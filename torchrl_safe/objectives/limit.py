@@ -74,8 +74,8 @@ class LimitController(nn.Module):
                 from update to update.
 
         Returns:
-            The limit to hold the policy to until the next update, at least 0: a loss's
-            ``cost_limit``.
+            The limit to hold the policy to until the next update, at least 0: the argument
+            ``cost_limit`` of a loss's ``constraint``.
 
         Raises:
             ValueError: if ``level`` is not finite, or ``cost_limit`` negative or not finite; the

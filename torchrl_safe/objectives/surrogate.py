@@ -639,7 +639,12 @@ class CVaRSurrogateLoss(CostLoss, _SurrogateLoss):
         return CostMoments(mean, variance, horizon, square_horizon)
 
     def constraint(
-        self, tensordict: TensorDictBase, log_prob: Tensor, measured: CostMoments
+        self,
+        tensordict: TensorDictBase,
+        log_prob: Tensor,
+        measured: CostMoments,
+        *,
+        cost_limit: float | None = None,
     ) -> Tensor:
         """The constraint, ``Gamma - cost_limit``, feasible at or below 0.
 
@@ -650,23 +655,29 @@ class CVaRSurrogateLoss(CostLoss, _SurrogateLoss):
             measured (CostMoments): what :meth:`measure` returned for the policy that the advantages
                 belong to.
 
+        Keyword Args:
+            cost_limit (float, optional): the limit of now, of a schedule or of a
+                :class:`~torchrl_safe.objectives.LimitController`. Defaults to the loss's.
+
         Returns:
             The constraint, a scalar, in units of the discounted cost sum.
 
         Raises:
             KeyError: if there are no advantages in the data.
             TypeError: if ``measured`` is something else.
+            ValueError: if ``cost_limit`` is negative or not finite.
         """
         if not isinstance(measured, CostMoments):
             raise TypeError(
                 f"measured must be what measure(...) returned, got {type(measured).__name__}."
             )
+        limit = self._limit(cost_limit)
         keys = self.tensor_keys
         advantage = self._computed(tensordict, keys.cost_advantage)
         change = self._change(tensordict, log_prob, advantage, 0.0)  # of the mean cost per step
         mean = measured.mean + measured.horizon * change
         if self.risk_level == 1:
-            return mean - self.cost_limit
+            return mean - limit
         center = self._computed(tensordict, keys.cost_value)
         center = self._mean(center.squeeze(-1), tensordict)
         deviation = self._computed(tensordict, keys.square_advantage) - 2 * center * advantage
@@ -674,4 +685,4 @@ class CVaRSurrogateLoss(CostLoss, _SurrogateLoss):
         variance = measured.variance + measured.square_horizon * deviation
         # The root has no slope at 0; a variance this small has no part in a CVaR.
         std = variance.clamp(min=1e-8).sqrt()
-        return gaussian_cvar(mean, std, self.risk_level) - self.cost_limit
+        return gaussian_cvar(mean, std, self.risk_level) - limit

@@ -1,11 +1,14 @@
-"""Curvature of the trust region: products with the KL's Hessian, and conjugate gradients."""
+"""Natural gradients: products with the KL's Hessian, conjugate gradients, and what they span."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from typing import NamedTuple, TypeAlias
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
@@ -238,6 +241,110 @@ def conjugate_gradient(
     return ConjugateGradient(
         solution * scale, residual * scale, relative.squeeze(-1), negative.squeeze(-1)
     )
+
+
+class NoStep(Exception):
+    """A step that cannot be computed; the message says why."""
+
+
+class NaturalGradients(NamedTuple):
+    """Natural gradients ``H^-1 g_i`` of k functions, as far as the iterations have solved for them.
+
+    However few these were, :attr:`gram` is exactly that of what :meth:`combine` returns.
+    """
+
+    basis: Tensor
+    """What spans them, [k, n], in double precision."""
+    coefficients: NDArray[np.float64]
+    """Natural gradients in the basis, in columns, [k, k]."""
+    gram: NDArray[np.float64]
+    """Inner products ``g_i' H^-1 g_j``, [k, k]."""
+    cg_residual: float
+    """Largest relative residual of the systems."""
+    dtype: torch.dtype
+    """Of the gradients."""
+
+    def combine(self, weights: NDArray[np.float64]) -> Tensor:
+        """The sum of natural gradients with weights [k], shape [n]."""
+        in_basis = torch.as_tensor(self.coefficients @ weights, device=self.basis.device)
+        return (in_basis @ self.basis).to(self.dtype)
+
+
+def natural_gradients(
+    product: Product,
+    gradients: Tensor,
+    *,
+    damping: float,
+    iterations: int,
+    repeat: Repeat = one_by_one,
+) -> NaturalGradients:
+    """Natural gradients ``(H + damping)^-1 g`` of several functions at once.
+
+    Args:
+        product (callable): from vectors [k, n] to ``H v`` [k, n].
+        gradients (torch.Tensor): shape [k, n].
+
+    Keyword Args:
+        damping (float): added to the diagonal of ``H``.
+        iterations (int): of the conjugate gradients.
+        repeat (callable): runs the iterations. Defaults to
+            :func:`~torchrl_safe.optim.repetition.one_by_one`.
+
+    Returns:
+        NaturalGradients: their span and their inner products.
+
+    Raises:
+        NoStep: if a number is not finite or the damped curvature not positive definite.
+
+    Examples:
+        >>> hessian, gradients = torch.diag(torch.tensor([1.0, 4.0])), torch.tensor([[1.0, 2.0]])
+        >>> natural = natural_gradients(
+        ...     lambda v: v @ hessian, gradients, damping=0.0, iterations=2
+        ... )
+        >>> natural.combine(np.ones(1)), natural.gram.round(6).tolist()
+        (tensor([1.0000, 0.5000]), [[2.0]])
+    """
+    systems = conjugate_gradient(
+        lambda vectors: product(vectors) + damping * vectors, gradients, iterations, repeat=repeat
+    )
+    residual = float(systems.relative_residual.max())
+    # Double precision also keeps reduced-precision matrix products out of the subproblem.
+    solved, wanted = systems.solution.double(), gradients.double()
+    linear = (wanted @ solved.T).cpu().numpy()
+    curvature = (solved @ (wanted - systems.residual.double()).T).cpu().numpy()
+    if not (math.isfinite(residual) and np.isfinite([linear, curvature]).all()):
+        raise NoStep("a gradient or a product with the curvature is not finite")
+    flat = gradients.any(-1).cpu().numpy() & (np.diag(curvature) <= 0)
+    if flat.any() or bool(systems.negative.any()):
+        raise NoStep("the curvature is not positive definite; more damping may help")
+    coefficients, gram = _galerkin(curvature, linear, torch.finfo(gradients.dtype).eps)
+    return NaturalGradients(solved, coefficients, gram, residual, gradients.dtype)
+
+
+def _galerkin(
+    curvature: NDArray[np.float64], linear: NDArray[np.float64], eps: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """The subproblem, restricted to the span of unfinished solutions ``X``.
+
+    Inside that span the natural gradients are ``X G^+ (L')``, with ``G = X'HX`` and ``L`` the
+    gradients' products with ``X``. Their Gram matrix is ``L G^+ L'`` however few iterations the
+    conjugate gradients had: the step's predicted changes and its size in the metric are exact.
+
+    Args:
+        curvature (numpy.ndarray): ``G``, shape [k, k].
+        linear (numpy.ndarray): ``L``, shape [k, k].
+        eps (float): resolution of the vectors' dtype; directions as similar as that count as one.
+
+    Returns:
+        tuple: coefficients of the natural gradients in ``X`` (in columns) and their Gram matrix.
+    """
+    scale = np.sqrt(np.diag(curvature))
+    scale = np.where(scale > 0, scale, 1.0)
+    unit = (curvature + curvature.T) / np.outer(2 * scale, scale)
+    inverse = np.linalg.pinv(unit, rcond=10 * eps, hermitian=True) / np.outer(scale, scale)
+    basis = inverse @ linear.T
+    gram = linear @ basis
+    return basis, (gram + gram.T) / 2
 
 
 def _pull(outputs: Sequence[Tensor], inputs: Sequence[Tensor], weights: Sequence[Tensor]) -> list:

@@ -124,23 +124,23 @@ def solve_subproblem(
     flat = bool(((variance == 0) & (c > 0)).any())
     if not (kept.size or flat):
         return Subproblem("inert" if m else "unconstrained", objective_scale, weight)
-    faces = _Faces(gram[1:, 1:][np.ix_(kept, kept)])
+    sets = _ActiveSets(gram[1:, 1:][np.ix_(kept, kept)])
     distance = distance[kept]
     case = "feasible"
     if flat or (distance > _FEASIBILITY).any():
-        target, repaired = _recover(faces, distance, recovery_ratio)
+        target, repaired = _recover(sets, distance, recovery_ratio)
         if not (target[distance > 0] > _FEASIBILITY).any():
             return Subproblem("rejected", 0.0, weight, "no step lowers a violated constraint")
         case = "recoverable" if repaired and not flat else "infeasible"
         distance = target
-    along_objective, along_constraint = faces.best(distance, gram[0, 0], gram[0, 1:][kept])
+    along_objective, along_constraint = sets.best(distance, gram[0, 0], gram[0, 1:][kept])
     scale = unit[1:][kept]
     weight[kept] = along_constraint * length / scale
     return Subproblem(case, along_objective * objective_scale, weight)
 
 
-class _Faces:
-    """The faces of the polyhedron ``v_i'y <= -d_i`` under a fixed set of unit vectors.
+class _ActiveSets:
+    """The sets of constraints ``v_i'y <= -d_i`` that may hold with equality, each a flat of points.
 
     Args:
         gram (numpy.ndarray): ``v_i'v_j``, shape [m, m].
@@ -152,7 +152,7 @@ class _Faces:
         active = active[np.argsort(active.sum(1), kind="stable")].astype(bool)
         both = active[:, :, None] & active[:, None, :]
         restricted = np.where(both, gram, np.eye(m))
-        # Linearly dependent gradients add nothing: an independent subset has the same face.
+        # Linearly dependent gradients add nothing: an independent subset has the same flat.
         values, vectors = np.linalg.eigh(restricted)
         independent = (values > _DEPENDENT).all(-1)
         self.gram = gram
@@ -161,12 +161,12 @@ class _Faces:
         self.values, self.vectors = values[independent], vectors[independent]
 
     def _solve(self, rhs: Array) -> Array:
-        """Weights ``G_A^-1 rhs_A`` of each face's constraints A, zero elsewhere, [sets, m]."""
+        """Weights ``G_A^-1 rhs_A`` of each set A, zero elsewhere, [sets, m]."""
         rhs = np.where(self.active, rhs, 0.0)[:, None, :] @ self.vectors / self.values[:, None, :]
         return np.where(self.active, (self.vectors @ rhs.swapaxes(1, 2))[..., 0], 0.0)
 
     def _nearest(self, distance: Array, radius: float) -> tuple[Array, Array, NDArray[np.bool_]]:
-        """Weights of the point of each face nearest to the origin, [sets, m], and its norm^2.
+        """Weights of the point of each flat nearest to the origin, [sets, m], and its norm^2.
 
         And whether that is within the radius.
         """
@@ -199,26 +199,26 @@ class _Faces:
         nearest, norm, near = self._nearest(distance, radius)
         slope = self._solve(cosine)
         free = unit - slope @ cosine
-        # What is left of the objective along each face, none where it is normal to the face.
+        # What is left of the objective along each flat, none where it is normal to it.
         free = np.where(free > _DEPENDENT, free, 0.0)
         room = np.sqrt(np.clip(radius**2 - norm, 0, None))
         along = np.divide(room, np.sqrt(free), out=np.zeros_like(room), where=free > 0)
-        # Where a face only touches the ball, rounding may leave no more than its nearest point.
+        # Where a flat only touches the ball, rounding may leave no more than its nearest point.
         a = np.concatenate([along, np.zeros_like(along)])
         nearest, slope, free, near = (np.concatenate([x, x]) for x in (nearest, slope, free, near))
         weight = nearest + a[:, None] * slope
         valid = near & self._feasible(a[:, None] * cosine - weight @ self.gram, distance)
-        # u'y; the part along the face is a * free, without cancellation.
+        # u'y; the part along the flat is a * free, without cancellation.
         objective = np.where(valid, a * free - nearest @ cosine, -np.inf)
         index = int(objective.argmax())
         return float(a[index]), weight[index]
 
 
-def _recover(faces: _Faces, distance: Array, radius: float) -> tuple[Array, bool]:
+def _recover(sets: _ActiveSets, distance: Array, radius: float) -> tuple[Array, bool]:
     """Distances to go when violations fall as :func:`solve_subproblem` says.
 
     Args:
-        faces (_Faces): of the constraints.
+        sets (_ActiveSets): of the constraints.
         distance (numpy.ndarray): ``d_i``, shape [m].
         radius (float): of the region that recovery may use.
 
@@ -227,23 +227,23 @@ def _recover(faces: _Faces, distance: Array, radius: float) -> tuple[Array, bool
     """
     violated = distance > 0
     left, target = violated.copy(), np.where(violated, 0.0, distance)
-    if faces.reaches(distance, radius):
+    if sets.reaches(distance, radius):
         return distance, True
     for i in np.flatnonzero(violated)[np.argsort(distance[violated], kind="stable")]:
         more = target.copy()
         more[i] = distance[i]
-        if faces.reaches(more, radius):
+        if sets.reaches(more, radius):
             left[i], target = False, more
     # What is left, lowered together: none of it could be removed, so there is none to stop at.
-    down = -faces.gram @ left
+    down = -sets.gram @ left
     length = np.sqrt(max(-down @ left, 0.0))
     aligned = length > np.sqrt(_DEPENDENT)
     cosine = down / length if aligned else np.zeros_like(down)
-    a, weight = faces.best(target, float(aligned), cosine, radius)
-    fall = np.where(left, weight @ faces.gram - a * cosine, 0.0)
+    a, weight = sets.best(target, float(aligned), cosine, radius)
+    fall = np.where(left, weight @ sets.gram - a * cosine, 0.0)
     # As found, or by as much less as rounding asks for: at the last slack nothing more has to fall.
     for slack in (0.0, *10.0 ** np.arange(-12, 1)):
         lowered = np.where(left, np.clip(fall - slack, 0, distance), target)
-        if faces.reaches(lowered, radius):
+        if sets.reaches(lowered, radius):
             break
     return lowered, False

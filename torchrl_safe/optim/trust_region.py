@@ -18,14 +18,16 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from torchrl_safe.optim.curvature import (
+    NoStep,
+    Product,
     Statistics,
     StatisticsKL,
-    conjugate_gradient,
     detach,
     flatten,
     gauss_newton_product,
     gradient,
     hessian_product,
+    natural_gradients,
     unflatten,
 )
 from torchrl_safe.optim.repetition import CudaGraphRepeat, one_by_one
@@ -104,10 +106,6 @@ class TrustRegionReport:
 # Of the line search: a share of max_kl, and of the most that one step can lower a constraint by.
 _TOLERANCE = 0.01
 _ROUNDING = 8  # of a closure's numbers, in units of their resolution
-
-
-class _Rejected(Exception):
-    """A step that cannot be computed; the message says why."""
 
 
 @dataclass(frozen=True)
@@ -285,7 +283,7 @@ class TrustRegionSafeOptimizer(torch.optim.Optimizer):
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", message=".*duplicate parameters")
             super().add_param_group(param_group)  # which only warns of them
-        self._check_params(self.param_groups[0]["params"])
+        _check_params(self.param_groups[0]["params"], self.cuda_graph)
 
     # Solving the subproblem is no work for a compiler, nor is a graph that is differentiated twice.
     @torch.compiler.disable
@@ -313,7 +311,7 @@ class TrustRegionSafeOptimizer(torch.optim.Optimizer):
         params = [p for p in settings["params"] if p.requires_grad]
         if not params:
             raise ValueError("params must hold one that requires a gradient, got none that does.")
-        self._check_params(params)
+        _check_params(params, self.cuda_graph)
         backup = [p.detach().clone() for p in params]
         grads = [p.grad for p in params]
         for p in params:  # aside, so that a closure with a backward pass adds to none of them
@@ -338,6 +336,7 @@ class TrustRegionSafeOptimizer(torch.optim.Optimizer):
         backup: list[Tensor],
         settings: dict[str, Any],
     ) -> TrustRegionReport:
+        """Evaluates where it starts, proposes a step, and searches along it."""
         max_kl = settings["lr"] * settings["max_kl"]
         with torch.enable_grad():
             out = self._call(closure)
@@ -354,20 +353,20 @@ class TrustRegionSafeOptimizer(torch.optim.Optimizer):
             }
             try:
                 proposal = self._propose(out, before, params, settings, max_kl)
-            except _Rejected as rejection:
-                return TrustRegionReport("rejected", False, str(rejection), **report)
+            except NoStep as reason:
+                return TrustRegionReport("rejected", False, str(reason), **report)
         report.update(case=proposal.case, cg_residual=proposal.cg_residual)
         del out  # The graph, before the candidates are evaluated.
 
         moves = unflatten(proposal.direction, params)
-        reason = ""
+        refusal = ""
         for backtracks in range(settings["max_backtracks"] + 1):
             fraction = settings["backtrack_ratio"] ** backtracks
             with torch.no_grad():
                 _move(params, torch._foreach_add(backup, moves, alpha=fraction))
                 after = self._evaluate(self._call(closure), old)
-            reason = _refusal(before, after, max_kl, proposal.reach)
-            if not reason:
+            refusal = _refusal(before, after, max_kl, proposal.reach)
+            if not refusal:
                 return TrustRegionReport(
                     accepted=True,
                     kl=after.kl,
@@ -381,85 +380,10 @@ class TrustRegionSafeOptimizer(torch.optim.Optimizer):
                 )
         return TrustRegionReport(
             accepted=False,
-            reason=f"the line search is exhausted: {reason}",
+            reason=f"the line search is exhausted: {refusal}",
             backtracks=settings["max_backtracks"] + 1,
             **report,
         )
-
-    def _propose(
-        self,
-        out: TensorDictBase,
-        before: _Evaluation,
-        params: list[Tensor],
-        settings: dict[str, Any],
-        max_kl: float,
-    ) -> _Proposal:
-        """Linearises, finds the natural gradients and solves the subproblem."""
-        if not before.is_finite():
-            raise _Rejected(f"the closure returned {before}")
-        if self.statistics_kl is None:
-            product = hessian_product(out.get("kl"), params)
-        else:
-            statistics = out.get("curvature_statistics", None)
-            if statistics is None:
-                statistics = out.get("statistics")
-            product = gauss_newton_product(statistics, self.statistics_kl, params)
-        gradients = _gradients(out, params)
-        damping = settings["damping"]
-        systems = conjugate_gradient(
-            lambda vectors: product(vectors) + damping * vectors,
-            gradients,
-            settings["cg_iters"],
-            repeat=self._graphs if self.cuda_graph else one_by_one,
-        )
-        residual = float(systems.relative_residual.max())
-        # Double precision also keeps reduced-precision matrix products out of the subproblem.
-        solved, wanted = systems.solution.double(), gradients.double()
-        linear = (wanted @ solved.T).cpu().numpy()
-        curvature = (solved @ (wanted - systems.residual.double()).T).cpu().numpy()
-        if not (math.isfinite(residual) and np.isfinite([linear, curvature]).all()):
-            raise _Rejected("a gradient or a product with the curvature is not finite")
-        flat = gradients.any(-1).cpu().numpy() & (np.diag(curvature) <= 0)
-        if flat.any() or bool(systems.negative.any()):
-            raise _Rejected("the curvature is not positive definite; more damping may help")
-        basis, gram = _galerkin(curvature, linear, torch.finfo(gradients.dtype).eps)
-        solution = solve_subproblem(
-            gram[0, 0],
-            gram[1:, 0],
-            gram[1:, 1:],
-            before.constraint,
-            max_kl,
-            settings["recovery_ratio"],
-        )
-        if solution.reason:
-            raise _Rejected(solution.reason)
-        dual = np.array([solution.objective_weight, *-solution.constraint_weight])
-        if not dual.any():
-            raise _Rejected("the best step is none: no gradient leads anywhere better")
-        weights = torch.as_tensor(basis @ dual, device=solved.device)
-        return _Proposal(
-            case=solution.case,
-            direction=(weights @ solved).to(gradients.dtype),
-            predicted=(gram @ dual).tolist(),
-            reach=np.sqrt(2 * max_kl * np.diag(gram).clip(0)),
-            cg_residual=residual,
-        )
-
-    def _check_params(self, params: list[Tensor]) -> None:
-        if not params:
-            raise ValueError("params must hold at least one parameter, got none.")
-        if len({id(p) for p in params}) < len(params):
-            raise ValueError("params must hold every parameter once, got one of them twice.")
-        kinds = {(p.dtype, p.device) for p in params}
-        if len(kinds) != 1 or not params[0].is_floating_point():
-            raise ValueError(
-                "params must share one floating-point dtype and one device, got "
-                f"{sorted(f'{dtype} on {device}' for dtype, device in kinds)}."
-            )
-        if self.cuda_graph and not params[0].is_cuda:
-            raise ValueError(
-                f"cuda_graph=True needs params on a CUDA device, got {params[0].device}."
-            )
 
     def _call(self, closure: Closure) -> TensorDictBase:
         out = closure()
@@ -504,6 +428,54 @@ class TrustRegionSafeOptimizer(torch.optim.Optimizer):
         eps = max(torch.finfo(value.dtype).eps for value in compared)
         return _Evaluation(float(numbers[1]), numbers[2:], float(numbers[0]), eps)
 
+    def _propose(
+        self,
+        out: TensorDictBase,
+        before: _Evaluation,
+        params: list[Tensor],
+        settings: dict[str, Any],
+        max_kl: float,
+    ) -> _Proposal:
+        """The subproblem's step out of the natural gradients; :class:`NoStep` if there is none."""
+        if not before.is_finite():
+            raise NoStep(f"the closure returned {before}")
+        natural = natural_gradients(
+            self._kl_product(out, params),
+            _gradients(out, params),
+            damping=settings["damping"],
+            iterations=settings["cg_iters"],
+            repeat=self._graphs if self.cuda_graph else one_by_one,
+        )
+        solution = solve_subproblem(
+            natural.gram[0, 0],
+            natural.gram[1:, 0],
+            natural.gram[1:, 1:],
+            before.constraint,
+            max_kl,
+            settings["recovery_ratio"],
+        )
+        if solution.reason:
+            raise NoStep(solution.reason)
+        dual = np.array([solution.objective_weight, *-solution.constraint_weight])
+        if not dual.any():
+            raise NoStep("the best step is none: no gradient leads anywhere better")
+        return _Proposal(
+            case=solution.case,
+            direction=natural.combine(dual),
+            predicted=(natural.gram @ dual).tolist(),
+            reach=np.sqrt(2 * max_kl * np.diag(natural.gram).clip(0)),
+            cg_residual=natural.cg_residual,
+        )
+
+    def _kl_product(self, out: TensorDictBase, params: list[Tensor]) -> Product:
+        """Products with the curvature of the KL in the parameters."""
+        if self.statistics_kl is None:
+            return hessian_product(out.get("kl"), params)
+        statistics = out.get("curvature_statistics", None)
+        if statistics is None:
+            statistics = out.get("statistics")
+        return gauss_newton_product(statistics, self.statistics_kl, params)
+
 
 def _gradients(out: TensorDictBase, params: list[Tensor]) -> Tensor:
     """Gradients of the objective and of the constraints, [1 + m, n]."""
@@ -511,32 +483,6 @@ def _gradients(out: TensorDictBase, params: list[Tensor]) -> Tensor:
     if out.get("constraint", None) is not None:
         outputs += [(f"constraint[{i}]", c) for i, c in enumerate(out.get("constraint").unbind())]
     return torch.stack([flatten(gradient(name, [output], params)) for name, output in outputs])
-
-
-def _galerkin(
-    curvature: NDArray[np.float64], linear: NDArray[np.float64], eps: float
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """The subproblem, restricted to the span of unfinished solutions ``X``.
-
-    Inside that span the natural gradients are ``X G^+ (L')``, with ``G = X'HX`` and ``L`` the
-    gradients' products with ``X``. Their Gram matrix is ``L G^+ L'`` however few iterations the
-    conjugate gradients had: the step's predicted changes and its size in the metric are exact.
-
-    Args:
-        curvature (numpy.ndarray): ``G``, shape [k, k].
-        linear (numpy.ndarray): ``L``, shape [k, k].
-        eps (float): resolution of the vectors' dtype; directions as similar as that count as one.
-
-    Returns:
-        tuple: coefficients of the natural gradients in ``X`` (in columns) and their Gram matrix.
-    """
-    scale = np.sqrt(np.diag(curvature))
-    scale = np.where(scale > 0, scale, 1.0)
-    unit = (curvature + curvature.T) / np.outer(2 * scale, scale)
-    inverse = np.linalg.pinv(unit, rcond=10 * eps, hermitian=True) / np.outer(scale, scale)
-    basis = inverse @ linear.T
-    gram = linear @ basis
-    return basis, (gram + gram.T) / 2
 
 
 def _refusal(
@@ -584,3 +530,18 @@ def _check_settings(settings: dict[str, Any]) -> None:
         value = settings.get(name)
         if not (isinstance(value, kind) and check(value)):
             raise ValueError(f"{name} must be {text}, got {value!r}.")
+
+
+def _check_params(params: list[Tensor], cuda_graph: bool) -> None:
+    if not params:
+        raise ValueError("params must hold at least one parameter, got none.")
+    if len({id(p) for p in params}) < len(params):
+        raise ValueError("params must hold every parameter once, got one of them twice.")
+    kinds = {(p.dtype, p.device) for p in params}
+    if len(kinds) != 1 or not params[0].is_floating_point():
+        raise ValueError(
+            "params must share one floating-point dtype and one device, got "
+            f"{sorted(f'{dtype} on {device}' for dtype, device in kinds)}."
+        )
+    if cuda_graph and not params[0].is_cuda:
+        raise ValueError(f"cuda_graph=True needs params on a CUDA device, got {params[0].device}.")

@@ -1,4 +1,4 @@
-"""Pictures: every robot and interface, several renderers at once, windows, and how long one takes."""
+"""Pictures of every robot and interface: several renderers at once, windows, how long one takes."""
 
 from __future__ import annotations
 

@@ -1152,7 +1152,7 @@ bad(
     lambda: envs.cost_from_info(make_env()),
     TypeError,
     "env",
-    "SafeGoalEnv",
+    "SafeRobotEnv",
     "GymWrapper or GymEnv",
 )
 bad(
@@ -1279,7 +1279,7 @@ control = cache(lambda: suite.load(random=0))
 control().reset()
 control_state = lambda: control().task._core.snapshot()  # noqa: E731
 each("suite.load", suite.load, "robot", ("unicycle",), ROBOT)
-each("suite.load", suite.load, "task", ("push",), "'goal' or a Task")
+each("suite.load", suite.load, "task", ("push",), "one of goal, navigation")
 each("suite.load", suite.load, "episode_length", (0,), "an integer >= 1")
 each("suite.load", suite.load, "random", (-1,), ">= 0")
 bad(

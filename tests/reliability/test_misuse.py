@@ -46,7 +46,7 @@ from torchrl_safe import (
     envs,
     record,
 )
-from torchrl_safe.envs import suite
+from torchrl_safe.envs.interfaces import suite
 from torchrl_safe.modules import (
     DeterministicAction,
     GMMParamExtractor,
@@ -1028,7 +1028,8 @@ each("SafeGoalEnv", make_env, "robot", ("unicycle", 3), ROBOT)
 for name in ("num_envs", "num_threads", "episode_length"):
     each("SafeGoalEnv", make_env, name, (0, -1, 2.5, True), "an integer >= 1")
 each("SafeGoalEnv", make_env, "seed", (-1, 1.5, "one"), "None or an integer >= 0")
-each("SafeGoalEnv", make_env, "task", ("goal", envs.GoalTask), "a task", TypeError)
+each("SafeGoalEnv", make_env, "task", (envs.GoalTask, 3), "a task", TypeError)
+each("SafeGoalEnv", make_env, "task", ("walk",), "one of goal, navigation")
 each("SafeGoalEnv", make_env, "randomization", ({"mass": (1, 2)},), "Randomization", TypeError)
 bad(
     "SafeGoalEnv: a task for robots with a footprint",
@@ -1140,7 +1141,7 @@ each("Randomization", envs.Randomization, "actuator_delay", ((-1, 1),), ">= 0")
 each("Randomization", envs.Randomization, "sensor_noise", ((-0.1, 0.1),), ">= 0")
 each("Randomization", envs.Randomization, "lidar_dropout", ((0.5, 1.5),), "in [0, 1]")
 
-# Costs, checks, and the other faces.
+# Costs, checks, and the other interfaces.
 
 for name in ("num_steps", "time_limit"):
     each(
@@ -1180,7 +1181,7 @@ bad(
     lambda: envs.cost_from_info(make_env()),
     TypeError,
     "env",
-    "SafeGoalEnv",
+    "SafeRobotEnv",
     "GymWrapper or GymEnv",
 )
 bad(
@@ -1234,16 +1235,16 @@ bad(
     "a number",
 )
 
-gym = cache(envs.GymGoalEnv)
-vector = cache(lambda: envs.GymGoalVectorEnv(num_envs=3, num_threads=1, autoreset_mode="Disabled"))
-many = partial(envs.GymGoalVectorEnv, num_envs=3, num_threads=1)
-for make, face, shape in ((gym, envs.GymGoalEnv, (2,)), (vector, many, (3, 2))):
-    owner = "GymGoalEnv" if make is gym else "GymGoalVectorEnv"
+gym = cache(envs.GymRobotEnv)
+vector = cache(lambda: envs.GymRobotVectorEnv(num_envs=3, num_threads=1, autoreset_mode="Disabled"))
+many = partial(envs.GymRobotVectorEnv, num_envs=3, num_threads=1)
+for make, interface, shape in ((gym, envs.GymRobotEnv, (2,)), (vector, many, (3, 2))):
+    owner = "GymRobotEnv" if make is gym else "GymRobotVectorEnv"
     make().reset(seed=0)
     state = lambda make=make: make()._core.snapshot()  # noqa: E731
-    each(owner, face, "robot", ("unicycle",), ROBOT)
-    each(owner, face, "episode_length", (0,), "an integer >= 1")
-    each(owner, face, "render_mode", ("ascii",), "None or one of ['rgb_array'")
+    each(owner, interface, "robot", ("unicycle",), ROBOT)
+    each(owner, interface, "episode_length", (0,), "an integer >= 1")
+    each(owner, interface, "render_mode", ("ascii",), "None or one of ['rgb_array'")
     for name, action, *says in (
         ("shape", np.zeros(5), "(5,)", f"shape {shape}"),
         ("kind", np.full(shape, "x"), "<U1", "must be numbers"),
@@ -1275,10 +1276,10 @@ for make, face, shape in ((gym, envs.GymGoalEnv, (2,)), (vector, many, (3, 2))):
         ">= 0",
         state=state,
     )
-each("GymGoalVectorEnv", many, "autoreset_mode", ("Never",), "'NextStep'")
-each("GymGoalVectorEnv", many, "num_envs", (0,), "an integer >= 1")
+each("GymRobotVectorEnv", many, "autoreset_mode", ("Never",), "'NextStep'")
+each("GymRobotVectorEnv", many, "num_envs", (0,), "an integer >= 1")
 bad(
-    "GymGoalVectorEnv.reset: seeds",
+    "GymRobotVectorEnv.reset: seeds",
     lambda: vector().reset(seed=[1, 2]),
     ValueError,
     "seed",
@@ -1287,7 +1288,7 @@ bad(
     state=lambda: vector()._core.snapshot(),
 )
 bad(
-    "GymGoalVectorEnv.reset: mask",
+    "GymRobotVectorEnv.reset: mask",
     lambda: vector().reset(options={"reset_mask": np.zeros(2)}),
     ValueError,
     "reset_mask",
@@ -1307,7 +1308,7 @@ control = cache(lambda: suite.load(random=0))
 control().reset()
 control_state = lambda: control().task._core.snapshot()  # noqa: E731
 each("suite.load", suite.load, "robot", ("unicycle",), ROBOT)
-each("suite.load", suite.load, "task", ("push",), "'goal' or a Task")
+each("suite.load", suite.load, "task", ("push",), "one of goal, navigation")
 each("suite.load", suite.load, "episode_length", (0,), "an integer >= 1")
 each("suite.load", suite.load, "random", (-1,), ">= 0")
 bad(

@@ -15,12 +15,7 @@ import sys
 from pathlib import Path
 
 HERE = Path(__file__).parents[1]
-ESTIMATES = [
-    "retrace_lambda_return_estimate",
-    "importance_sampling_lambda_return_estimate",
-    "tree_backup_lambda_return_estimate",
-    "q_lambda_return_estimate",
-]
+ESTIMATE = "trace_lambda_return_estimate"
 SAFETAC_ONLY = {
     "retrace_variance_reward",
     "squared_td_error",
@@ -41,7 +36,10 @@ def definitions(path: str, without: set[str] = frozenset()) -> str:
     lines = text.splitlines()
     parts = []
     for node in ast.parse(text).body:
-        if isinstance(node, ast.Assign) and ast.unparse(node.targets[0]).startswith("_M"):
+        if isinstance(node, (ast.Assign, ast.AnnAssign)):
+            target = node.target if isinstance(node, ast.AnnAssign) else node.targets[0]
+            if not ast.unparse(target).startswith(("_LOG", "_MAX")):
+                continue
             parts.append("\n".join(lines[node.lineno - 1 : node.end_lineno]))
         elif isinstance(node, (ast.FunctionDef, ast.ClassDef)) and node.name not in without:
             first = min([node.lineno, *(line.lineno for line in node.decorator_list)])
@@ -78,10 +76,8 @@ def main(root: Path) -> None:
     files = {}
 
     text = (value / "functional.py").read_text()
-    text = insert(
-        text, '"vtrace_advantage_estimate"', "".join(f'    "{name}",\n' for name in ESTIMATES)
-    )
-    text = insert(text, "import math", "from collections.abc import Sequence\n")
+    text = insert(text, '"vtrace_advantage_estimate"', f'    "{ESTIMATE}",\n')
+    text = insert(text, "import math", "from collections.abc import Callable, Sequence\n")
     text = insert(text, "import torch", "").replace(
         "import torch\n", "import torch\nfrom torch import Tensor\n", 1
     )
@@ -111,7 +107,7 @@ def main(root: Path) -> None:
         "from tensordict.utils import unravel_key\n\n"
         "from torchrl.data.tensor_specs import Bounded, Categorical, OneHot, TensorSpec\n",
     )
-    text = insert(text, "td0_return_estimate,", "    retrace_lambda_return_estimate,\n")
+    text = insert(text, "td0_return_estimate,", f"    {ESTIMATE},\n")
     text = insert(
         text,
         "def _standardize_by_group(",
@@ -143,16 +139,15 @@ def main(root: Path) -> None:
         text = upstream((tests / f"test_retrace_{name}.py").read_text())
         if name == "functional":
             text = text.replace(
-                "from torchrl.objectives.value import (",
-                "from torchrl.objectives.value.functional import (",
+                f"from torchrl.objectives.value import {ESTIMATE}",
+                f"from torchrl.objectives.value.functional import {ESTIMATE}",
             )
         else:
             text = text.replace(
-                "from torchrl.objectives.value import RetraceEstimator, "
-                "retrace_lambda_return_estimate",
+                f"from torchrl.objectives.value import RetraceEstimator, {ESTIMATE}",
                 "from torchrl.objectives.utils import ValueEstimators\n"
                 "from torchrl.objectives.value import RetraceEstimator\n"
-                "from torchrl.objectives.value.functional import retrace_lambda_return_estimate",
+                f"from torchrl.objectives.value.functional import {ESTIMATE}",
             )
         text = insert(text, "import pytest", "import sys\n\n").replace(
             "\n\nimport sys", "\nimport sys"

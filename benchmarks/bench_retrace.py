@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 from torchrl.objectives.value.functional import vec_td_lambda_return_estimate
 
-from torchrl_safe.objectives.value.functional import retrace_lambda_return_estimate
+from torchrl_safe.objectives.value.functional import trace_lambda_return_estimate
 
 GAMMA, LMBDA = 0.99, 0.97
 
@@ -49,7 +49,7 @@ def bench_targets(
         for tensor in (log_pi, log_mu, value, next_value, reward, done, terminated)
     ]
     if implementation == "retrace":
-        target = benchmark(timed(retrace_lambda_return_estimate), GAMMA, LMBDA, *data)
+        target = benchmark(timed(trace_lambda_return_estimate), GAMMA, LMBDA, *data)
         torch.testing.assert_close(target, retrace_loop(*data))
     elif implementation == "retrace_loop":
         benchmark(timed(retrace_loop), *data)

@@ -77,8 +77,8 @@ PARTS = [
         "states is `curvature_statistics`.",
     ),
     Part(
-        "Robots and faces",
-        "python benchmarks/bench_faces.py",
+        "Robots and interfaces",
+        "python benchmarks/bench_interfaces.py",
         "Frames per second, and in brackets the share of the floor: the physics of the same model "
         "on as many threads, nothing else. Medians of rounds in which all rows take turns.",
     ),
@@ -228,7 +228,7 @@ def tiny_arguments(part: Part) -> list[str]:
     """What makes a part end in seconds."""
     if part.command.startswith(PYTEST):
         return ["--benchmark-max-time=0.01", "--benchmark-warmup=off", "-k", TINY_BENCHMARKS]
-    if "bench_faces" in part.command:
+    if "bench_interfaces" in part.command:
         return ["point", "--rounds", "1", "--seconds", "0.01"]
     return TINY
 

@@ -27,12 +27,12 @@ from torchrl.envs.utils import check_env_specs
 
 from torchrl_safe.envs import (
     CostToReward,
-    GymGoalEnv,
+    GymRobotEnv,
     SafeFrameSkip,
     check_safe_env,
     cost_from_info,
-    suite,
 )
+from torchrl_safe.envs.interfaces import suite
 
 POINT = "torchrl_safe/PointGoal-v0"
 
@@ -52,7 +52,7 @@ class SixTuple(gymnasium.Wrapper):
         return observation, reward, info["cost"], terminated, truncated, info
 
 
-class NaNEnv(GymGoalEnv):
+class NaNEnv(GymRobotEnv):
     def step(self, action):
         *out, info = super().step(action)
         return *out, info | {"cost": float("nan")}
@@ -106,8 +106,8 @@ class TestHighway:
 
 class TestCostFromInfo:
     def test_values(self):
-        env = cost_from_info(GymWrapper(GymGoalEnv()), violation_above=0.5)
-        plain = GymGoalEnv()
+        env = cost_from_info(GymWrapper(GymRobotEnv()), violation_above=0.5)
+        plain = GymRobotEnv()
         env.set_seed(7)  # resets
         plain.reset(seed=7)
         rollout = env.rollout(30, auto_reset=False, tensordict=env.reset())
@@ -340,11 +340,11 @@ class TestBadCost:
 
 class TestCostToReward:
     def test_torchrls_safety_gymnasium_wrapper(self):
-        env = SafetyGymnasiumWrapper(SixTuple(GymGoalEnv(episode_length=9)))
+        env = SafetyGymnasiumWrapper(SixTuple(GymRobotEnv(episode_length=9)))
         assert env.observation_spec["cost"].shape == ()  # why it needs an adapter
         env = TransformedEnv(env, CostToReward(violation_above=0.5))
         check_safe_env(env, time_limit=9)
-        plain = GymGoalEnv()
+        plain = GymRobotEnv()
         env.set_seed(2)
         plain.reset(seed=2)
         rollout = env.rollout(9)
@@ -384,7 +384,7 @@ class TestCostToReward:
         """Their costs would be lost in silence, while TorchRL adds up their rewards."""
         for skipping in (
             DMControlWrapper(suite.load("point", random=0), frame_skip=2),
-            SafetyGymnasiumWrapper(SixTuple(GymGoalEnv()), frame_skip=2),
+            SafetyGymnasiumWrapper(SixTuple(GymRobotEnv()), frame_skip=2),
             TransformedEnv(DMControlWrapper(suite.load("point")), FrameSkipTransform(2)),
             TransformedEnv(DMControlWrapper(suite.load("point")), SafeFrameSkip(2)),
         ):

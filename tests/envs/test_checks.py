@@ -12,10 +12,10 @@ import torch
 from torchrl.data import Binary, Composite, Unbounded
 from torchrl.envs import RewardSum, SerialEnv, StepCounter, TransformedEnv
 
-from torchrl_safe.envs import ROBOTS, GoalTask, SafeGoalEnv, check_safe_env
+from torchrl_safe.envs import ROBOTS, GoalTask, SafeRobotEnv, check_safe_env
 
 
-def make(cls=SafeGoalEnv, num_envs=4, num_threads=1, episode_length=9, **options):
+def make(cls=SafeRobotEnv, num_envs=4, num_threads=1, episode_length=9, **options):
     return cls(
         "point",
         num_envs=num_envs,
@@ -28,10 +28,10 @@ def make(cls=SafeGoalEnv, num_envs=4, num_threads=1, episode_length=9, **options
 @pytest.mark.parametrize("robot", ROBOTS)
 def test_ours(robot):
     env, twin = (
-        SafeGoalEnv(robot, num_envs=3, num_threads=threads, episode_length=9) for threads in (1, 2)
+        SafeRobotEnv(robot, num_envs=3, num_threads=threads, episode_length=9) for threads in (1, 2)
     )
     check_safe_env(env, twins=[twin], time_limit=9)
-    check_safe_env(SafeGoalEnv(robot, num_envs=1, num_threads=1))
+    check_safe_env(SafeRobotEnv(robot, num_envs=1, num_threads=1))
 
 
 def test_transformed_and_nested():
@@ -45,7 +45,7 @@ def test_says_nothing(capfd):
     assert capfd.readouterr() == ("", "")
 
 
-class NoCost(SafeGoalEnv):
+class NoCost(SafeRobotEnv):
     """The cost is an observation, as in TorchRL's SafetyGymnasiumEnv."""
 
     def __init__(self, *args, **kwargs):
@@ -60,7 +60,7 @@ class NoCost(SafeGoalEnv):
         return td.set("cost", torch.zeros(*self.batch_size, 1))
 
 
-class DoubleCost(SafeGoalEnv):
+class DoubleCost(SafeRobotEnv):
     def __init__(self, *args, **kwargs):
         super().__init__(*args, **kwargs)
         spec = Unbounded((*self.batch_size, 1), dtype=torch.float64)
@@ -73,26 +73,26 @@ class DoubleCost(SafeGoalEnv):
         return td.set("cost", td["cost"].double())
 
 
-class NoViolation(SafeGoalEnv):
+class NoViolation(SafeRobotEnv):
     def __init__(self, *args, **kwargs):
         super().__init__(*args, **kwargs)
         del self.observation_spec["violation"]
 
-    def _to_tensordict(self, frame, rewards):
-        return super()._to_tensordict(frame, rewards).exclude("violation")
+    def _to_tensordict(self, frame, *, stepped):
+        return super()._to_tensordict(frame, stepped=stepped).exclude("violation")
 
 
-class NumberViolation(SafeGoalEnv):
+class NumberViolation(SafeRobotEnv):
     def __init__(self, *args, **kwargs):
         super().__init__(*args, **kwargs)
         self.observation_spec["violation"] = Binary(1, (*self.batch_size, 1), dtype=torch.int64)
 
-    def _to_tensordict(self, frame, rewards):
-        td = super()._to_tensordict(frame, rewards)
+    def _to_tensordict(self, frame, *, stepped):
+        td = super()._to_tensordict(frame, stepped=stepped)
         return td.set("violation", td["violation"].long())
 
 
-class Stepping(SafeGoalEnv):
+class Stepping(SafeRobotEnv):
     """Lets ``spoil`` change what every step returns."""
 
     def _step(self, tensordict):
@@ -123,7 +123,7 @@ class NegativeCost(Stepping):
         return td.set("cost", -td["cost"])
 
 
-class CostAlone(SafeGoalEnv):
+class CostAlone(SafeRobotEnv):
     def __init__(self, *args, **kwargs):
         super().__init__(*args, **kwargs)
         self.full_reward_spec = Composite(cost=self.full_reward_spec["cost"], shape=self.batch_size)
@@ -132,7 +132,7 @@ class CostAlone(SafeGoalEnv):
         return super()._step(tensordict).exclude("reward")
 
 
-class BadStart(SafeGoalEnv):
+class BadStart(SafeRobotEnv):
     """Nothing to see before the first step."""
 
     def _reset(self, tensordict=None, **kwargs):
@@ -158,7 +158,7 @@ class TerminatesToo(Stepping):
         return td.set("terminated", td["terminated"] | td["truncated"])
 
 
-class Unseeded(SafeGoalEnv):
+class Unseeded(SafeRobotEnv):
     def _set_seed(self, seed):
         pass
 
@@ -182,19 +182,19 @@ class Reuses(Stepping):
         return td.set("observation", self.buffer.copy_(td["observation"]))
 
 
-class ResetsAll(SafeGoalEnv):
+class ResetsAll(SafeRobotEnv):
     def _reset(self, tensordict=None, **kwargs):
         return super()._reset(None, **kwargs)
 
 
-class ResetsNone(SafeGoalEnv):
+class ResetsNone(SafeRobotEnv):
     def _reset(self, tensordict=None, **kwargs):
         if tensordict is not None and not tensordict["_reset"].all():
             tensordict = tensordict.set("_reset", torch.zeros_like(tensordict["_reset"]))
         return super()._reset(tensordict, **kwargs)
 
 
-class SharedStream(SafeGoalEnv):
+class SharedStream(SafeRobotEnv):
     """A reset of some takes a draw from the streams of the others."""
 
     def _reset(self, tensordict=None, **kwargs):
@@ -203,7 +203,7 @@ class SharedStream(SafeGoalEnv):
         return td
 
 
-class HalfAState(SafeGoalEnv):
+class HalfAState(SafeRobotEnv):
     def load_state_dict(self, state_dict, **kwargs):
         kept = dict(self.state_dict())
         super().load_state_dict({**state_dict, "elapsed": kept["elapsed"]})

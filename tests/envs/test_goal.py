@@ -17,7 +17,7 @@ from torchrl.collectors import Collector, MultiSyncCollector
 from torchrl.envs import RewardSum, StepCounter, TransformedEnv
 from torchrl.envs.utils import RandomPolicy, check_env_specs
 
-from torchrl_safe.envs import GoalTask, SafeGoalEnv, get_robot
+from torchrl_safe.envs import GoalTask, SafeRobotEnv, get_robot
 
 # Point, written from the published numbers and with its contacts on.
 PLAIN_POINT = """
@@ -52,8 +52,8 @@ PLAIN_POINT = """
 """
 
 
-def make(num_envs: int = 6, num_threads: int = 1, **options) -> SafeGoalEnv:
-    return SafeGoalEnv("point", num_envs=num_envs, num_threads=num_threads, **options)
+def make(num_envs: int = 6, num_threads: int = 1, **options) -> SafeRobotEnv:
+    return SafeRobotEnv("point", num_envs=num_envs, num_threads=num_threads, **options)
 
 
 def actions(steps: int, num_envs: int = 6, seed: int = 0) -> torch.Tensor:
@@ -61,7 +61,7 @@ def actions(steps: int, num_envs: int = 6, seed: int = 0) -> torch.Tensor:
     return torch.rand(steps, num_envs, 2, generator=generator) * 2 - 1
 
 
-def drive(env: SafeGoalEnv, controls: torch.Tensor, *, reset: bool = True) -> TensorDict:
+def drive(env: SafeRobotEnv, controls: torch.Tensor, *, reset: bool = True) -> TensorDict:
     """Steps under fixed actions, resetting what is done: [T, N]."""
     td = env.reset() if reset else env.reset(no_reset(env))
     steps = []
@@ -72,13 +72,13 @@ def drive(env: SafeGoalEnv, controls: torch.Tensor, *, reset: bool = True) -> Te
     return torch.stack(steps)
 
 
-def no_reset(env: SafeGoalEnv) -> TensorDict:
+def no_reset(env: SafeRobotEnv) -> TensorDict:
     mask = torch.zeros(*env.batch_size, 1, dtype=torch.bool)
     frame = env.fake_tensordict().exclude("next", "action")
     return frame.set("_reset", mask)
 
 
-def seek(env: SafeGoalEnv) -> torch.Tensor:
+def seek(env: SafeRobotEnv) -> torch.Tensor:
     """Actions that turn to the goal and drive at it."""
     out = torch.zeros(*env.batch_size, 2)
     for i in range(len(out)):
@@ -288,8 +288,8 @@ class TestDeterminism:
     def test_threads(self):
         options = {"num_envs": 9, "episode_length": 20, "seed": 4}
         controls = actions(60, 9)
-        one = drive(SafeGoalEnv(num_threads=1, **options), controls)
-        two = drive(SafeGoalEnv(num_threads=2, **options), controls)
+        one = drive(SafeRobotEnv(num_threads=1, **options), controls)
+        two = drive(SafeRobotEnv(num_threads=2, **options), controls)
         assert equal(one, two)
 
     def test_seeds(self):
@@ -337,7 +337,7 @@ class TestState:
         assert equal(expected, self.resumed(other, saved))
 
     @staticmethod
-    def resumed(env: SafeGoalEnv, saved: dict) -> TensorDict:
+    def resumed(env: SafeRobotEnv, saved: dict) -> TensorDict:
         env.load_state_dict(saved)
         return drive(env, actions(40, seed=1), reset=False)
 
@@ -403,7 +403,7 @@ class TestBadInput:
     )
     def test_constructor(self, options, match):
         with pytest.raises(ValueError, match=match):
-            SafeGoalEnv(**options)
+            SafeRobotEnv(**options)
 
     @pytest.mark.parametrize("bad", [math.nan, math.inf])
     def test_action_is_not_finite(self, bad):
@@ -491,7 +491,7 @@ def test_what_a_step_ends_in_is_checked_too(tmp_path, monkeypatch):
     asset.write_text(PLAIN_POINT.replace('damping=".01"', ""))
     # One physics step of two seconds: 9e9 m/s are legal, and lead to where nothing may be.
     point = replace(get_robot("point"), asset=str(asset), timestep=2.0, substeps=1)
-    env = SafeGoalEnv(point, num_envs=2, num_threads=1)
+    env = SafeRobotEnv(point, num_envs=2, num_threads=1)
     before = env.reset()
     state = env.state_dict()
     state["physics"][0, 1 + 3] = 9e9
@@ -542,7 +542,7 @@ class TestRender:
         assert self.bright_red(env) > 50
 
     @staticmethod
-    def bright_red(env: SafeGoalEnv) -> int:
+    def bright_red(env: SafeRobotEnv) -> int:
         red, green, blue = env.render(0).astype(int).reshape(-1, 3).T
         return int(((red > 170) & (green < 70) & (blue < 70)).sum())
 
@@ -599,7 +599,7 @@ class TestTorchRL:
 
     @pytest.mark.slow
     def test_multi_process_collector(self):
-        make_env = partial(SafeGoalEnv, num_envs=2, num_threads=1)
+        make_env = partial(SafeRobotEnv, num_envs=2, num_threads=1)
         collector = MultiSyncCollector(
             [make_env, partial(make_env, seed=1)],
             RandomPolicy(make_env().action_spec),

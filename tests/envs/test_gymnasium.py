@@ -1,4 +1,4 @@
-"""The Gymnasium face: registration, Gymnasium's own checker, what users lean on, bad input."""
+"""The Gymnasium interface: registration, Gymnasium's own checker, what users lean on, bad input."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode
 
-from torchrl_safe.envs import ROBOTS, GoalTask, GymGoalEnv, GymGoalVectorEnv
+from torchrl_safe.envs import ROBOTS, GoalTask, GymRobotEnv, GymRobotVectorEnv
 
 POINT = "torchrl_safe/PointGoal-v0"
 
@@ -21,7 +21,7 @@ def identifier(robot: str) -> str:
     return f"torchrl_safe/{robot.title().replace('_', '')}Goal-v0"
 
 
-def make_vec(num_envs: int = 3, **options) -> GymGoalVectorEnv:
+def make_vec(num_envs: int = 3, **options) -> GymRobotVectorEnv:
     return gymnasium.make_vec(POINT, num_envs=num_envs, num_threads=1, **options)
 
 
@@ -29,14 +29,14 @@ class TestRegistration:
     @pytest.mark.parametrize("robot", ROBOTS)
     def test_make(self, robot):
         env = gymnasium.make(identifier(robot))
-        assert isinstance(env.unwrapped, GymGoalEnv)
+        assert isinstance(env.unwrapped, GymRobotEnv)
         observation, _ = env.reset(seed=0)
         assert observation in env.observation_space
 
     @pytest.mark.parametrize("robot", ROBOTS)
     def test_make_vec(self, robot):
         envs = gymnasium.make_vec(identifier(robot), num_envs=3, num_threads=1)
-        assert isinstance(envs, GymGoalVectorEnv)
+        assert isinstance(envs, GymRobotVectorEnv)
         observations, _ = envs.reset(seed=0)
         assert observations in envs.observation_space
 
@@ -157,7 +157,7 @@ class TestResetIsNoStep:
         """Sums of reward and cost over the steps of single environments, [2, N]."""
         sums = np.zeros((2, num_envs))
         for row, seed in enumerate(seeds):
-            env = GymGoalEnv(episode_length=length)
+            env = GymRobotEnv(episode_length=length)
             env.reset(seed=seed)
             count = 0
             while count < steps:
@@ -187,7 +187,7 @@ class TestResetIsNoStep:
 
     def test_after_a_reset(self):
         zero = {"cost": 0.0, "violation": False, "violations": 0, "goal_met": False}
-        env, envs = GymGoalEnv(), make_vec(autoreset_mode="Disabled")
+        env, envs = GymRobotEnv(), make_vec(autoreset_mode="Disabled")
         assert env.reset(seed=0)[1] == zero
         env.reset()[1]["cost"] = 9.0
         assert env.reset()[1] == zero
@@ -216,7 +216,7 @@ class TestSeeds:
 
     @pytest.mark.parametrize("kind", [list, tuple, np.array])
     def test_one_for_each(self, kind):
-        envs, singles = make_vec(autoreset_mode="Disabled"), [GymGoalEnv() for _ in range(3)]
+        envs, singles = make_vec(autoreset_mode="Disabled"), [GymRobotEnv() for _ in range(3)]
         seeds = [9, 9, 2]
         expected = np.array([env.reset(seed=s)[0] for env, s in zip(singles, seeds, strict=True)])
         found, _ = envs.reset(seed=kind(seeds))
@@ -226,7 +226,7 @@ class TestSeeds:
         assert (envs.reset()[0] == np.array([env.reset()[0] for env in singles])).all()
 
     def test_none_goes_on(self):
-        envs, singles = make_vec(), [GymGoalEnv() for _ in range(3)]
+        envs, singles = make_vec(), [GymRobotEnv() for _ in range(3)]
         for env, seed in zip(singles, [1, 2, 3], strict=True):
             env.reset(seed=seed)
         envs.reset(seed=[1, 2, 3])
@@ -252,7 +252,7 @@ class TestSeeds:
         assert list(options) == ["reset_mask"]
 
 
-@pytest.mark.parametrize("make", [GymGoalEnv, make_vec], ids=["single", "vector"])
+@pytest.mark.parametrize("make", [GymRobotEnv, make_vec], ids=["single", "vector"])
 class TestCopies:
     @pytest.mark.parametrize("clone", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))])
     @pytest.mark.parametrize("drawn", [False, True])
@@ -332,10 +332,10 @@ class TestEnv:
         assert (first[0] != first[1]).any()
         assert (env.reset(seed=6)[0] != first[0]).any()
         # Without a seed, no two environments are the same.
-        assert (GymGoalEnv().reset()[0] != GymGoalEnv().reset()[0]).any()
+        assert (GymRobotEnv().reset()[0] != GymRobotEnv().reset()[0]).any()
 
     def test_snapshot(self):
-        env = GymGoalEnv()
+        env = GymRobotEnv()
         env.reset(seed=0)
         snapshot, layout = env.snapshot(), env.layout()
         first = [env.step(np.array([1.0, 0.3]))[0] for _ in range(3)]
@@ -351,7 +351,7 @@ class TestVectorEnv:
             envs = make_vec(autoreset_mode=value)
             assert envs.metadata["autoreset_mode"] is envs.autoreset_mode is mode
         # Those of the class and of others stay as they were.
-        assert GymGoalVectorEnv.metadata["autoreset_mode"] is AutoresetMode.NEXT_STEP
+        assert GymRobotVectorEnv.metadata["autoreset_mode"] is AutoresetMode.NEXT_STEP
 
     def test_spaces(self):
         envs = make_vec(5)
@@ -415,13 +415,13 @@ class TestVectorEnv:
 class TestBadInput:
     @pytest.mark.parametrize("action", [np.zeros(3), np.zeros((1, 2)), 0.5, np.array(["a", "b"])])
     def test_action_shape(self, action):
-        env = GymGoalEnv()
+        env = GymRobotEnv()
         env.reset(seed=0)
         with pytest.raises(ValueError, match=r"action must be numbers of shape \(2,\), got"):
             env.step(action)
 
     def test_action_not_finite_moves_nothing(self):
-        env, envs = GymGoalEnv(), make_vec()
+        env, envs = GymRobotEnv(), make_vec()
         env.reset(seed=0)
         envs.reset(seed=0)
         before, before_vector = env.snapshot(), envs._core.snapshot()
@@ -432,7 +432,7 @@ class TestBadInput:
         for old, core in ((before, env._core), (before_vector, envs._core)):
             assert all((old[name] == value).all() for name, value in core.snapshot().items())
 
-    @pytest.mark.parametrize("cls", [GymGoalEnv, GymGoalVectorEnv])
+    @pytest.mark.parametrize("cls", [GymRobotEnv, GymRobotVectorEnv])
     def test_constructor(self, cls):
         with pytest.raises(ValueError, match=r"robot must be one of .*'point'.*, got 'tank'"):
             cls("tank")
@@ -450,7 +450,7 @@ class TestBadInput:
             make_vec(autoreset_mode="Later")
 
     def test_reset(self):
-        for env in (GymGoalEnv(), make_vec()):
+        for env in (GymRobotEnv(), make_vec()):
             with pytest.raises(ValueError, match=r"unknown reset options: \['layout'\]"):
                 env.reset(options={"layout": 1})
             with pytest.raises(ValueError, match="seed must be None or an integer >= 0"):
@@ -469,6 +469,6 @@ class TestBadInput:
                 make_vec().reset(options={"reset_mask": mask})
 
     def test_before_reset(self):
-        for env in (GymGoalEnv(), make_vec()):
+        for env in (GymRobotEnv(), make_vec()):
             with pytest.raises(RuntimeError, match="reset the environment"):
                 env.step(env.action_space.sample())

@@ -15,7 +15,7 @@ from torch import nn
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from walking import Walking
 
-from torchrl_safe.envs import GoalTask, SafeGoalEnv, get_robot
+from torchrl_safe.envs import GoalTask, SafeRobotEnv, get_robot
 from torchrl_safe.envs.legs import INPUT_SIZE, controller_input, load_legs, torques
 
 ASSET = get_robot("doggo").asset_path.parent / "doggo_legs.safetensors"
@@ -28,7 +28,7 @@ MOTORS = [
 
 def walk(num_robots: int, num_steps: int, length: float = 1.0, threads: int = 2):
     """Displacement along each robot's own way [N]; has it ever tipped, has it at the end [N]."""
-    env = SafeGoalEnv(
+    env = SafeRobotEnv(
         "doggo", num_envs=num_robots, num_threads=threads, task=GoalTask(num_hazards=0), seed=3
     )
     env.reset()
@@ -77,7 +77,7 @@ class TestWalking:
 
     def test_a_snapshot_knows_the_beat(self):
         """Taken at each of a period's steps; what follows is what followed."""
-        env = SafeGoalEnv("doggo", num_envs=3, num_threads=1)
+        env = SafeRobotEnv("doggo", num_envs=3, num_threads=1)
         env.reset()
         td = TensorDict({"action": torch.tensor([[1.0, 0.0], [-1.0, 0.5], [0.0, -1.0]])}, [3])
         for _ in range(4):
@@ -94,7 +94,7 @@ class TestWalking:
     def test_a_reset_starts_the_beat_again(self):
         """Two robots, one of them put down later: the same torques from then on."""
         control = get_robot("doggo").control
-        env = SafeGoalEnv("doggo", num_envs=2, num_threads=1)
+        env = SafeRobotEnv("doggo", num_envs=2, num_threads=1)
         td = env.reset()
         for _ in range(3):
             env.step(TensorDict({"action": torch.ones(2, 2)}, [2]))
@@ -170,7 +170,7 @@ class TestController:
         """The task's observation and the robot's own input agree step by step."""
         legs = load_legs(ASSET)
         task = Walking(num_directions=4)
-        by_motors = SafeGoalEnv("doggo_torques", num_envs=4, num_threads=1, task=task)
+        by_motors = SafeRobotEnv("doggo_torques", num_envs=4, num_threads=1, task=task)
         td = by_motors.reset()
         robots = by_motors._core._robots
         control = get_robot("doggo").control

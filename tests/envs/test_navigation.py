@@ -12,7 +12,7 @@ import torch
 from tensordict import TensorDict
 from torchrl.envs.utils import check_env_specs
 
-from torchrl_safe.envs import NavigationTask, SafeGoalEnv, get_robot
+from torchrl_safe.envs import NavigationTask, SafeRobotEnv, get_robot
 from torchrl_safe.envs._random import RandomStreams
 from torchrl_safe.envs.robots import Motion
 from torchrl_safe.envs.tasks import navigation
@@ -24,11 +24,11 @@ FOOTPRINT = (0.229, 0.208)
 STOP, AHEAD = (-1.0, 0.0), (1.0, 0.0)
 
 
-def make(num_envs: int = 4, num_threads: int = 1, **options) -> SafeGoalEnv:
-    return SafeGoalEnv("jackal", num_envs=num_envs, num_threads=num_threads, **options)
+def make(num_envs: int = 4, num_threads: int = 1, **options) -> SafeRobotEnv:
+    return SafeRobotEnv("jackal", num_envs=num_envs, num_threads=num_threads, **options)
 
 
-def step(env: SafeGoalEnv, action) -> TensorDict:
+def step(env: SafeRobotEnv, action) -> TensorDict:
     action = torch.as_tensor(action, dtype=torch.float32).expand(*env.batch_size, 2)
     return env.step(TensorDict({"action": action.clone()}, env.batch_size))["next"]
 
@@ -510,7 +510,7 @@ class TestEnv:
             assert (again == expected).all()
 
 
-def seek(env: SafeGoalEnv, generator: torch.Generator) -> torch.Tensor:
+def seek(env: SafeRobotEnv, generator: torch.Generator) -> torch.Tensor:
     """Turns to the goal and drives at it, boxes or not."""
     out = torch.zeros(*env.batch_size, 2)
     for i in range(len(out)):
@@ -554,7 +554,7 @@ class TestBadInput:
 
     def test_robot_without_a_footprint(self):
         with pytest.raises(ValueError, match="'point' has no footprint"):
-            SafeGoalEnv("point", num_envs=2, task=NavigationTask())
+            SafeRobotEnv("point", num_envs=2, task=NavigationTask())
 
 
 def test_observation_against_a_loop():

@@ -17,11 +17,11 @@ from torchrl_safe.envs import (
     JACKAL_REAL,
     JACKAL_TRAINING,
     Randomization,
-    SafeGoalEnv,
+    SafeRobotEnv,
     get_robot,
 )
-from torchrl_safe.envs._core import make_core
 from torchrl_safe.envs._random import RandomStreams
+from torchrl_safe.envs._robot import make_core
 from torchrl_safe.envs.randomization import Variation, add_noise, drop_readings
 
 WIDE = Randomization(
@@ -34,9 +34,9 @@ WIDE = Randomization(
 )
 
 
-def make(robot: str = "jackal", num_envs: int = 5, num_threads: int = 1, **options) -> SafeGoalEnv:
+def make(robot: str = "jackal", num_envs: int = 5, num_threads: int = 1, **options) -> SafeRobotEnv:
     options = {"randomization": WIDE} | options
-    return SafeGoalEnv(robot, num_envs=num_envs, num_threads=num_threads, **options)
+    return SafeRobotEnv(robot, num_envs=num_envs, num_threads=num_threads, **options)
 
 
 def core(robot: str, randomization: Randomization | None, num_envs: int = 4):
@@ -50,7 +50,7 @@ def core(robot: str, randomization: Randomization | None, num_envs: int = 4):
     )
 
 
-def drive(env: SafeGoalEnv, steps: int, seed: int = 0) -> TensorDict:
+def drive(env: SafeRobotEnv, steps: int, seed: int = 0) -> TensorDict:
     generator = torch.Generator().manual_seed(seed)
     out = []
     for _ in range(steps):

@@ -1,4 +1,4 @@
-"""Pictures: every robot and face, several renderers at once, windows, and how long one takes."""
+"""Pictures of every robot and interface: several renderers at once, windows, how long one takes."""
 
 from __future__ import annotations
 
@@ -21,9 +21,10 @@ import pytest
 import torch
 from gymnasium.utils.passive_env_checker import env_render_passive_checker
 
-from torchrl_safe.envs import ROBOTS, GymGoalEnv, SafeGoalEnv, get_robot, suite
-from torchrl_safe.envs._core import make_core
+from torchrl_safe.envs import ROBOTS, GymRobotEnv, SafeRobotEnv, get_robot
 from torchrl_safe.envs._render import Scene, SceneRenderer
+from torchrl_safe.envs._robot import make_core
+from torchrl_safe.envs.interfaces import suite
 
 
 def seeded_core(robot):
@@ -49,7 +50,7 @@ def run(code: str, **environ: str) -> subprocess.CompletedProcess:
 
 @pytest.fixture(scope="module")
 def opengl():
-    env = SafeGoalEnv(num_envs=1, num_threads=1)
+    env = SafeRobotEnv(num_envs=1, num_threads=1)
     env.reset()
     try:
         env.render(0, 16, 16)
@@ -93,7 +94,7 @@ class TestScene:
             assert (scene.data.qpos == core.qpos(index)).all()
 
     def test_picture(self, robot, opengl):
-        env = SafeGoalEnv(robot, num_envs=1, num_threads=1, seed=1)
+        env = SafeRobotEnv(robot, num_envs=1, num_threads=1, seed=1)
         env.reset()
         picture = env.render()
         assert picture.shape == (360, 480, 3)
@@ -188,7 +189,7 @@ class TestRobotsOfOnesOwn:
         pictures = []
         robots = ("point", dressed_point(tmp_path, *FILES.values()))
         for robot in robots:
-            env = SafeGoalEnv(robot, num_envs=1, num_threads=1, seed=1)
+            env = SafeRobotEnv(robot, num_envs=1, num_threads=1, seed=1)
             env.reset()
             pictures.append(env.render().astype(int))
             env.close()
@@ -199,7 +200,7 @@ class TestRobotsOfOnesOwn:
 class TestTogether:
     def test_the_cost_is_shown(self, opengl):
         """The corner changes with the cost and nothing else does."""
-        env = SafeGoalEnv(num_envs=1, num_threads=1, seed=0)
+        env = SafeRobotEnv(num_envs=1, num_threads=1, seed=0)
         env.reset()
         before = env.render()
         state = env.state_dict()
@@ -223,7 +224,7 @@ class TestTogether:
 
     def test_renderers_do_not_disturb_each_other(self, opengl):
         """Also dm_control's, which draws whether or not its context is the current one."""
-        one, two = (SafeGoalEnv(num_envs=1, num_threads=1, seed=seed) for seed in (0, 1))
+        one, two = (SafeRobotEnv(num_envs=1, num_threads=1, seed=seed) for seed in (0, 1))
         other = suite.load("point", random=2)
         other.reset()
         for env in (one, two):
@@ -239,7 +240,7 @@ class TestTogether:
         two.close()
         assert (draw_other() == third).all()
         assert (one.render() == first).all()
-        two = SafeGoalEnv(num_envs=1, num_threads=1, seed=1)
+        two = SafeRobotEnv(num_envs=1, num_threads=1, seed=1)
         two.reset()
         assert (two.render() == second).all()
         one.close()
@@ -254,12 +255,12 @@ class TestTogether:
         dm_control ends EGL at exit, for everybody, sooner or later than we do.
         """
         picture = """
-            env = SafeGoalEnv(num_envs=1, num_threads=1)
+            env = SafeRobotEnv(num_envs=1, num_threads=1)
             env.reset()
             env.render()
         """
         other = """
-            from torchrl_safe.envs import suite
+            from torchrl_safe.envs.interfaces import suite
             other = suite.load()
             other.reset()
             other.physics.render(48, 64)
@@ -269,13 +270,13 @@ class TestTogether:
             "before dm_control": picture + other,
             "after dm_control": other + picture,
         }
-        done = run("from torchrl_safe.envs import SafeGoalEnv\n" + textwrap.dedent(parts[order]))
+        done = run("from torchrl_safe.envs import SafeRobotEnv\n" + textwrap.dedent(parts[order]))
         assert done.returncode == 0
         assert "Exception ignored" not in done.stderr
         assert "Traceback" not in done.stderr
 
     def test_left_to_the_garbage_collector(self, opengl):
-        env = SafeGoalEnv(num_envs=1, num_threads=1)
+        env = SafeRobotEnv(num_envs=1, num_threads=1)
         env.reset()
         env.render(0, 16, 16)
         canvas = weakref.ref(env._renderer._canvas)
@@ -305,8 +306,8 @@ class TestTogether:
         """Nor does it free, at exit, what belongs to its parent."""
         code = """
             import os
-            from torchrl_safe.envs import SafeGoalEnv
-            env = SafeGoalEnv(num_envs=1, num_threads=1)
+            from torchrl_safe.envs import SafeRobotEnv
+            env = SafeRobotEnv(num_envs=1, num_threads=1)
             env.reset()
             before = env.render()
             if not os.fork():
@@ -325,22 +326,22 @@ class TestTogether:
         assert "Exception ignored" not in done.stderr
 
     @pytest.mark.skipif(sys.platform != "linux", reason="elsewhere there always is a display")
-    @pytest.mark.parametrize("face", ["SafeGoalEnv", "dm_control"])
-    def test_a_display_that_leads_nowhere(self, face, opengl):
+    @pytest.mark.parametrize("interface", ["SafeRobotEnv", "dm_control"])
+    def test_a_display_that_leads_nowhere(self, interface, opengl):
         code = {
-            "SafeGoalEnv": """
-                from torchrl_safe.envs import SafeGoalEnv
-                env = SafeGoalEnv(num_envs=1, num_threads=1)
+            "SafeRobotEnv": """
+                from torchrl_safe.envs import SafeRobotEnv
+                env = SafeRobotEnv(num_envs=1, num_threads=1)
                 env.reset()
                 assert env.render().std() > 5
             """,
             "dm_control": """
-                from torchrl_safe.envs import suite
+                from torchrl_safe.envs.interfaces import suite
                 env = suite.load()
                 env.reset()
                 assert env.physics.render(48, 64, camera_id="overview").std() > 5
             """,
-        }[face]
+        }[interface]
         done = run(textwrap.dedent(code), DISPLAY=":7891", MUJOCO_GL="")
         assert done.returncode == 0, done.stderr
 
@@ -351,13 +352,13 @@ class TestHuman:
         monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
         if sys.platform != "linux":
             pytest.skip("elsewhere there always is a display")
-        env = GymGoalEnv(render_mode="human")
+        env = GymRobotEnv(render_mode="human")
         with pytest.raises(RuntimeError, match=r'no display .* use render_mode="rgb_array"'):
             env.reset(seed=0)
         env.close()
 
     def test_no_mode(self):
-        env = GymGoalEnv()
+        env = GymRobotEnv()
         env.reset(seed=0)
         with pytest.warns(UserWarning, match=r"render\(\) draws nothing"):
             assert env.render() is None
@@ -406,7 +407,7 @@ class TestHuman:
 
 def test_real_time(opengl):
     """Processor time, as the clock on the wall measures what else the machine does."""
-    env = SafeGoalEnv(num_envs=1, num_threads=1, seed=0)
+    env = SafeRobotEnv(num_envs=1, num_threads=1, seed=0)
     td = env.reset()
     env.render()
     start = time.process_time()

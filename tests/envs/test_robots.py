@@ -15,8 +15,8 @@ import torch
 from tensordict import TensorDict
 from torchrl.envs.utils import check_env_specs
 
-from torchrl_safe.envs import ROBOTS, Randomization, SafeGoalEnv, get_robot
-from torchrl_safe.envs._core import RobotBatch, make_core
+from torchrl_safe.envs import ROBOTS, Randomization, SafeRobotEnv, get_robot
+from torchrl_safe.envs._robot import RobotBatch, make_core
 
 CAPSULE, CYLINDER = mujoco.mjtGeom.mjGEOM_CAPSULE, mujoco.mjtGeom.mjGEOM_CYLINDER
 BOX, SPHERE = mujoco.mjtGeom.mjGEOM_BOX, mujoco.mjtGeom.mjGEOM_SPHERE
@@ -336,7 +336,7 @@ def test_joint_readings_by_name():
 @pytest.mark.parametrize("name", ["car", "doggo", "doggo_torques"])
 class TestEnvironment:
     @staticmethod
-    def drive(env: SafeGoalEnv, steps: int, seed: int = 0) -> TensorDict:
+    def drive(env: SafeRobotEnv, steps: int, seed: int = 0) -> TensorDict:
         """Steps under random actions, resetting what is done: [T, N]."""
         generator = torch.Generator().manual_seed(seed)
         td = env.reset()
@@ -348,23 +348,23 @@ class TestEnvironment:
         return torch.stack(rollout)
 
     def test_check_env_specs(self, name):
-        check_env_specs(SafeGoalEnv(name, num_envs=3, num_threads=1, episode_length=7), seed=0)
+        check_env_specs(SafeRobotEnv(name, num_envs=3, num_threads=1, episode_length=7), seed=0)
 
     def test_sizes(self, name):
-        env = SafeGoalEnv(name, num_envs=2, num_threads=1)
+        env = SafeRobotEnv(name, num_envs=2, num_threads=1)
         sizes = {"car": (24, 2), "doggo": (24, 2), "doggo_torques": (64, 12)}
         assert env.observation_spec["observation"].shape == (2, sizes[name][0])
         assert env.action_spec.shape == (2, sizes[name][1])
 
     def test_threads(self, name):
         options = {"num_envs": 5, "episode_length": 15, "seed": 4}
-        one = self.drive(SafeGoalEnv(name, num_threads=1, **options), 40)
-        two = self.drive(SafeGoalEnv(name, num_threads=2, **options), 40)
+        one = self.drive(SafeRobotEnv(name, num_threads=1, **options), 40)
+        two = self.drive(SafeRobotEnv(name, num_threads=2, **options), 40)
         assert (one == two).all()
 
     def test_resumes_exactly(self, name):
         """The solver's first guess is part of the state."""
-        env = SafeGoalEnv(name, num_envs=3, num_threads=1)
+        env = SafeRobotEnv(name, num_envs=3, num_threads=1)
         self.drive(env, 10)
         state = env.state_dict()
         action = torch.linspace(-1, 1, env.action_spec.shape.numel()).view(env.action_spec.shape)
@@ -375,7 +375,7 @@ class TestEnvironment:
             assert (env.step(td.clone())["next", "observation"] == observation).all()
 
     def test_reset_puts_it_at_rest(self, name):
-        env = SafeGoalEnv(name, num_envs=20, num_threads=1)
+        env = SafeRobotEnv(name, num_envs=20, num_threads=1)
         self.drive(env, 10)
         env.reset()
         qpos, qvel = (env._core._robots.batch.bind(key) for key in ("qpos", "qvel"))
@@ -388,7 +388,7 @@ class TestEnvironment:
             np.testing.assert_allclose(x_axis, (*env.layout(i)["heading"], 0), atol=1e-12)
 
     def test_random_steps(self, name):
-        env = SafeGoalEnv(name, num_envs=32, num_threads=2)
+        env = SafeRobotEnv(name, num_envs=32, num_threads=2)
         rollout = self.drive(env, 150)
         assert rollout["next", "observation"].isfinite().all()
         assert env.instabilities == 0
@@ -398,7 +398,7 @@ class TestEnvironment:
 
 def test_a_robot_on_its_back_goes_on():
     """Safety Gym does not end an episode because of it."""
-    env = SafeGoalEnv("car", num_envs=2, num_threads=1, episode_length=50)
+    env = SafeRobotEnv("car", num_envs=2, num_threads=1, episode_length=50)
     env.reset()
     qpos = env._core._robots.batch.bind("qpos")
     qpos[0, 3:7] = 0, 1, 0, 0
@@ -412,7 +412,7 @@ def test_a_robot_on_its_back_goes_on():
 
 def test_car_drives():
     """Both wheels ahead: forwards along x. Right wheel only: a turn to the left."""
-    env = SafeGoalEnv("car", num_envs=2, num_threads=1)
+    env = SafeRobotEnv("car", num_envs=2, num_threads=1)
     env.reset()
     before = [env.layout(i) for i in range(2)]
     action = torch.tensor([[1.0, 1.0], [1.0, -1.0]])
@@ -430,7 +430,7 @@ def num_threads() -> int:
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
 @pytest.mark.parametrize("name", ROBOTS)
 def test_a_forked_process_goes_on_alike(name):
-    env, twin = (SafeGoalEnv(name, num_envs=4, num_threads=3) for _ in range(2))
+    env, twin = (SafeRobotEnv(name, num_envs=4, num_threads=3) for _ in range(2))
     td = TensorDict({"action": torch.full(env.action_spec.shape, 0.3)}, [4])
     for each in (env, twin):
         each.reset()
@@ -449,7 +449,7 @@ def test_a_forked_process_goes_on_alike(name):
 def test_close_ends_the_threads():
     gc.collect()  # of what other tests left
     before = num_threads()
-    env = SafeGoalEnv("point", num_envs=8, num_threads=4)
+    env = SafeRobotEnv("point", num_envs=8, num_threads=4)
     td = env.rollout(2)[:, -1]
     assert num_threads() == before + 3
     env.close()

@@ -14,9 +14,9 @@ import numpy as np
 import pytest
 from scipy.stats import ks_2samp
 
-from torchrl_safe.envs import SafeGoalEnv
-from torchrl_safe.envs._core import Core, make_core
+from torchrl_safe.envs import SafeRobotEnv
 from torchrl_safe.envs._random import RandomStreams
+from torchrl_safe.envs._robot import RobotCore, make_core
 from torchrl_safe.envs.tasks import SafetyGoalTask, SafetyTask, get_task
 from torchrl_safe.envs.tasks.bodies import own_size, read_sensors
 
@@ -72,7 +72,7 @@ def robot_state(robot: str, qpos: np.ndarray, qvel: np.ndarray) -> tuple[np.ndar
     )
 
 
-def put(core: Core, name: str, state: dict[str, np.ndarray]) -> None:
+def put(core: RobotCore, name: str, state: dict[str, np.ndarray]) -> None:
     """Puts all environments where the recorded ones were."""
     robots, objects = core._robots, dict(core._objects)
     batch, task = robots.batch, core.task
@@ -119,7 +119,7 @@ def put(core: Core, name: str, state: dict[str, np.ndarray]) -> None:
         )
 
 
-def replay(name: str, after: bool = False) -> Core:
+def replay(name: str, after: bool = False) -> RobotCore:
     robot, task = get_task(name)
     num_envs = len(steps(name, "reward"))
     core = make_core(
@@ -130,14 +130,14 @@ def replay(name: str, after: bool = False) -> Core:
     return core
 
 
-def due(core: Core, objects: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+def due(core: RobotCore, objects: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     task, motion = core.task, core._robots.motion
     assert isinstance(task, SafetyTask)
     readings = read_sensors(core.robot, task.bodies, motion.proprioception)
     return task.costs(readings, objects)
 
 
-def touching(core: Core) -> np.ndarray:
+def touching(core: RobotCore) -> np.ndarray:
     """Whether the robot touches anything, [N]."""
     task, motion = core.task, core._robots.motion
     assert isinstance(task, SafetyTask)
@@ -146,7 +146,7 @@ def touching(core: Core) -> np.ndarray:
     return np.concatenate([none, *touched.values()], 1).any(1)
 
 
-def first_steps(core: Core, name: str) -> np.ndarray:
+def first_steps(core: RobotCore, name: str) -> np.ndarray:
     """Car's first of each episode: its wheels are at distance zero from the floor, where rounding
     decides whether they touch."""
     length = recorded(name)["reward"].shape[1]
@@ -270,4 +270,4 @@ class TestNames:
 
 def test_a_robot_without_a_site_is_refused():
     with pytest.raises(ValueError, match="has no site 'robot'"):
-        SafeGoalEnv("jackal", task=SafetyGoalTask(1), num_envs=1, num_threads=1)
+        SafeRobotEnv("jackal", task=SafetyGoalTask(1), num_envs=1, num_threads=1)

@@ -1,4 +1,4 @@
-"""The dm_control face: the suite's manners, TorchRL's wrapper, drawing, bad input."""
+"""The dm_control interface: the suite's manners, TorchRL's wrapper, drawing, bad input."""
 
 from __future__ import annotations
 
@@ -16,7 +16,8 @@ from tensordict import TensorDict
 from torchrl.envs import DMControlWrapper
 from torchrl.envs.utils import check_env_specs
 
-from torchrl_safe.envs import ROBOTS, GoalTask, NavigationTask, SafeGoalEnv, suite
+from torchrl_safe.envs import ROBOTS, GoalTask, NavigationTask, SafeRobotEnv
+from torchrl_safe.envs.interfaces import suite
 
 
 def forward(robot: str) -> np.ndarray:
@@ -91,7 +92,7 @@ class TestAsInTheSuite:
         assert all(high == 1.0 for high in spec.maximum)
 
     def test_environment_arguments(self, robot):
-        env = suite.load(robot, "goal", {"random": 0}, {"flat_observation": True})
+        env = suite.load(robot, None, {"random": 0}, {"flat_observation": True})
         assert set(env.observation_spec()) == {control.FLAT_OBSERVATION_KEY}
         seconds = 2.5 * env.control_timestep()
         env = suite.load(robot, environment_kwargs={"time_limit": seconds})
@@ -101,7 +102,7 @@ class TestAsInTheSuite:
 
     def test_seeds_are_task_arguments(self, robot):
         def start(seed):
-            env = suite.load(robot, "goal", task_kwargs={"random": seed})
+            env = suite.load(robot, task_kwargs={"random": seed})
             return env.reset().observation["observation"]
 
         assert (start(3) == start(3)).all()
@@ -155,7 +156,7 @@ class TestPhysics:
 
     def test_it_moves_as_the_simulator_does(self, robot):
         env = suite.load(robot, random=0)
-        twin = SafeGoalEnv(robot, num_envs=1, num_threads=1, seed=0)
+        twin = SafeRobotEnv(robot, num_envs=1, num_threads=1, seed=0)
         env.reset()
         twin.reset()
         state = twin.state_dict()["physics"][0]
@@ -295,6 +296,13 @@ class TestEpisodes:
         assert len(env.physics.named.model.geom_rgba[:]) >= 2
 
 
+def test_a_task_by_name():
+    assert isinstance(suite.load("jackal", "navigation").task._core.task, NavigationTask)
+    with pytest.warns(DeprecationWarning, match="makes the robot's own task, 'navigation'"):
+        env = suite.load("jackal", "goal")
+    assert isinstance(env.task._core.task, NavigationTask)
+
+
 class TestBadInput:
     def test_load(self):
         with pytest.raises(TypeError, match=r"task_kwargs may hold .*num_hazards"):
@@ -303,7 +311,7 @@ class TestBadInput:
             suite.load("point", environment_kwargs={"n_sub_steps": 3})
         with pytest.raises(ValueError, match="keyframe_id must be None"):
             suite.load("point").physics.reset(0)
-        with pytest.raises(ValueError, match="task must be 'goal' or a Task, got 'walk'"):
+        with pytest.raises(ValueError, match="task must be one of goal, navigation, got 'walk'"):
             suite.load("point", "walk")
         with pytest.raises(ValueError, match="robot must be one of"):
             suite.load("tank")

@@ -26,7 +26,7 @@ from torchrl.envs import (
 )
 from torchrl.envs.utils import check_env_specs
 
-from torchrl_safe.envs import SafeFrameSkip, SafeGoalEnv, check_safe_env, cost_from_info
+from torchrl_safe.envs import SafeFrameSkip, SafeRobotEnv, check_safe_env, cost_from_info
 
 SKIP = 4
 
@@ -80,7 +80,7 @@ def follow(env, actions) -> TensorDict:
 
 class TestSafeFrameSkip:
     def make(self, *transforms, **options):
-        env = SafeGoalEnv(num_envs=3, num_threads=1, **options)
+        env = SafeRobotEnv(num_envs=3, num_threads=1, **options)
         return TransformedEnv(env, Compose(*transforms)) if transforms else env
 
     def test_against_steps_one_by_one(self):
@@ -156,12 +156,12 @@ class TestWhatTheDocsSay:
 
     @pytest.mark.parametrize("transform", [FrameSkipTransform(2), NoopResetEnv(2)])
     def test_one_reward_only(self, transform):
-        env = TransformedEnv(SafeGoalEnv(num_envs=1, num_threads=1), transform)
+        env = TransformedEnv(SafeRobotEnv(num_envs=1, num_threads=1), transform)
         with pytest.raises(KeyError, match="reward_key requested but more than one key"):
             env.rollout(2)
 
     def test_target_return(self):
-        env = SafeGoalEnv(num_envs=2, num_threads=1)
+        env = SafeRobotEnv(num_envs=2, num_threads=1)
         with pytest.raises(ValueError, match="multiple rewards are located at the same level"):
             TransformedEnv(env, TargetReturn(10.0)).rollout(2)
         env = TransformedEnv(
@@ -177,13 +177,13 @@ class TestWhatTheDocsSay:
         torch.testing.assert_close(rollout["target_cost"].double(), left, rtol=1e-6, atol=1e-5)
 
     def test_bounded_cost(self):
-        env = SafeGoalEnv(num_envs=2, num_threads=1)
+        env = SafeRobotEnv(num_envs=2, num_threads=1)
         with pytest.raises(NotImplementedError, match="BoundedContinuous"):
             TransformedEnv(env, RewardScaling(0.0, 2.0, in_keys=["cost"])).rollout(2)
 
     def test_multi_step(self):
         """Left to its defaults it adds up rewards and leaves the cost of one step."""
-        rollout = SafeGoalEnv(num_envs=2, num_threads=1).rollout(6)
+        rollout = SafeRobotEnv(num_envs=2, num_threads=1).rollout(6)
         cost = rollout["next", "cost"][..., 0]
         sums = cost[:, :-1] + 0.5 * cost[:, 1:]
         for keys, possible in ((["reward"], cost), (["reward", "cost"], sums)):
@@ -194,7 +194,7 @@ class TestWhatTheDocsSay:
 
     def test_the_rest(self):
         env = TransformedEnv(
-            SafeGoalEnv(num_envs=2, num_threads=1),
+            SafeRobotEnv(num_envs=2, num_threads=1),
             Compose(
                 DoubleToFloat(),
                 StepCounter(),

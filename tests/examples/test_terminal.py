@@ -66,14 +66,17 @@ class TestGracefulStop:
     @pytest.mark.parametrize("name", GracefulStop.names)
     def test_asks_first(self, name):
         number = getattr(signal, name)
-        before = signal.getsignal(number)
-        with GracefulStop() as stop:
-            assert not stop.requested
-            signal.raise_signal(number)
-            assert stop.requested
-            with pytest.raises(KeyboardInterrupt):
+        before = signal.signal(number, signal.SIG_DFL)  # whoever started pytest may ignore it
+        try:
+            with GracefulStop() as stop:
+                assert not stop.requested
                 signal.raise_signal(number)
-        assert signal.getsignal(number) is before
+                assert stop.requested
+                with pytest.raises(KeyboardInterrupt):
+                    signal.raise_signal(number)
+            assert signal.getsignal(number) is signal.SIG_DFL
+        finally:
+            signal.signal(number, before)
 
     def test_nohup_stays(self):
         before = signal.signal(signal.SIGHUP, signal.SIG_IGN)

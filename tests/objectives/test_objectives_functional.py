@@ -9,7 +9,7 @@ import torch
 from scipy import stats
 
 from torchrl_safe.modules import divergences
-from torchrl_safe.objectives import functional
+from torchrl_safe.objectives import functional, value
 from torchrl_safe.objectives.functional import (
     cvar_factor,
     discounted_cost_limit,
@@ -195,10 +195,17 @@ class TestSurrogateChange:
                 surrogate_change(x, x, x, x, gamma)
 
 
-@pytest.mark.parametrize("name", ["matched_bound_kl", "moment_matched_kl"])
-def test_the_divergences_have_moved(name):
-    with pytest.warns(DeprecationWarning, match=f"{name} is deprecated: it is .*modules"):
-        function = getattr(functional, name)
-    assert function is getattr(divergences, name)
+@pytest.mark.parametrize(
+    ("room", "name", "home", "new"),
+    [
+        (functional, "matched_bound_kl", divergences, "matched_bound_kl"),
+        (functional, "moment_matched_kl", divergences, "moment_matched_kl"),
+        (value, "retrace_lambda_return_estimate", value, "trace_lambda_return_estimate"),
+    ],
+)
+def test_names_of_before(room, name, home, new):
+    with pytest.warns(DeprecationWarning, match=rf"{name} is deprecated: it is {home.__name__}.*"):
+        function = getattr(room, name)
+    assert function is getattr(home, new)
     with pytest.raises(AttributeError, match=f"{name}_"):
-        getattr(functional, f"{name}_")
+        getattr(room, f"{name}_")

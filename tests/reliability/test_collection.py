@@ -160,12 +160,12 @@ def test_resumed_with_other_environments(tmp_path, overrides, width):
 
 @pytest.mark.long
 @pytest.mark.parametrize("when", ["weights", "batch"])
-def test_a_killed_actor_of_ray(patience, when):
+def test_a_killed_actor_of_ray(tmp_path, patience, when):
     ray = pytest.importorskip("ray")
     os.environ.setdefault("RAY_raylet_start_wait_time_s", "300")
     ray.init(address="local", num_cpus=2, include_dashboard=False, object_store_memory=2**27)
     try:
-        cfg = tiny.config(Path("run"), "collector.backend=ray")
+        cfg = tiny.config(tmp_path / "run", "collector.backend=ray")
         policy = TensorDictModule(
             nn.Sequential(nn.Linear(24, 2), nn.Tanh()), ["observation"], ["action"]
         )

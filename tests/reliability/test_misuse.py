@@ -45,7 +45,7 @@ from torchrl_safe import (
     envs,
     record,
 )
-from torchrl_safe.envs import suite
+from torchrl_safe.envs.interfaces import suite
 from torchrl_safe.modules import (
     DeterministicAction,
     GMMParamExtractor,
@@ -658,14 +658,14 @@ bad(
     "one log-density for the whole action",
 )
 column = zeros(4, 1)
-estimates = {
-    "retrace_lambda_return_estimate": (column, column),
-    "importance_sampling_lambda_return_estimate": (column, column),
-    "tree_backup_lambda_return_estimate": (column,),
-    "q_lambda_return_estimate": (),
+traces = {
+    "retrace": (column, column),
+    "importance_sampling": (column, column),
+    "tree_backup": (column, None),
+    "q_lambda": (None, None),
 }
-for name, densities in estimates.items():
-    function, no = getattr(value, name), column.bool()
+for trace, densities in traces.items():
+    name, no = f"trace_lambda_return_estimate, {trace}", column.bool()
 
     def estimate(
         gamma=0.9,
@@ -674,11 +674,14 @@ for name, densities in estimates.items():
         next_state_value=column,
         done=no,
         time_dim=-2,
-        function=function,
+        trace=trace,
         densities=densities,
     ):
-        values = (action_value, next_state_value, column, done)
-        return function(gamma, lmbda, *densities, *values, time_dim=time_dim)
+        return value.trace_lambda_return_estimate(
+            *(gamma, lmbda, *densities, action_value, next_state_value, column, done),
+            trace=trace,
+            time_dim=time_dim,
+        )
 
     each(name, estimate, "gamma", (-0.1, 1.1, NAN), "in [0, 1]")
     each(name, estimate, "lmbda", (2.0,), "in [0, 1]")
@@ -700,6 +703,23 @@ for name, densities in estimates.items():
         "torch.float32",
         "must be boolean",
     )
+    for i, missing in enumerate(("log_pi", "log_mu")):
+        if densities[i] is not None:
+            bad(
+                f"{name}: without {missing}",
+                partial(estimate, densities=[column] * i + [None] * (2 - i)),
+                ValueError,
+                missing,
+                "got None",
+                f"a tensor for trace={trace!r}",
+            )
+each(
+    "trace_lambda_return_estimate",
+    lambda trace: estimate(trace=trace, densities=(column, column)),
+    "trace",
+    ("v_trace",),
+    "'importance_sampling'",
+)
 for function in (value.retrace_variance_reward, value.squared_td_error):
     name = function.__name__
     each(
@@ -1008,7 +1028,8 @@ each("SafeGoalEnv", make_env, "robot", ("unicycle", 3), ROBOT)
 for name in ("num_envs", "num_threads", "episode_length"):
     each("SafeGoalEnv", make_env, name, (0, -1, 2.5, True), "an integer >= 1")
 each("SafeGoalEnv", make_env, "seed", (-1, 1.5, "one"), "None or an integer >= 0")
-each("SafeGoalEnv", make_env, "task", ("goal", envs.GoalTask), "a task", TypeError)
+each("SafeGoalEnv", make_env, "task", (envs.GoalTask, 3), "a task", TypeError)
+each("SafeGoalEnv", make_env, "task", ("walk",), "one of goal, navigation")
 each("SafeGoalEnv", make_env, "randomization", ({"mass": (1, 2)},), "Randomization", TypeError)
 bad(
     "SafeGoalEnv: a task for robots with a footprint",
@@ -1120,7 +1141,7 @@ each("Randomization", envs.Randomization, "actuator_delay", ((-1, 1),), ">= 0")
 each("Randomization", envs.Randomization, "sensor_noise", ((-0.1, 0.1),), ">= 0")
 each("Randomization", envs.Randomization, "lidar_dropout", ((0.5, 1.5),), "in [0, 1]")
 
-# Costs, checks, and the other faces.
+# Costs, checks, and the other interfaces.
 
 for name in ("num_steps", "time_limit"):
     each(
@@ -1160,7 +1181,7 @@ bad(
     lambda: envs.cost_from_info(make_env()),
     TypeError,
     "env",
-    "SafeGoalEnv",
+    "SafeRobotEnv",
     "GymWrapper or GymEnv",
 )
 bad(
@@ -1214,16 +1235,16 @@ bad(
     "a number",
 )
 
-gym = cache(envs.GymGoalEnv)
-vector = cache(lambda: envs.GymGoalVectorEnv(num_envs=3, num_threads=1, autoreset_mode="Disabled"))
-many = partial(envs.GymGoalVectorEnv, num_envs=3, num_threads=1)
-for make, face, shape in ((gym, envs.GymGoalEnv, (2,)), (vector, many, (3, 2))):
-    owner = "GymGoalEnv" if make is gym else "GymGoalVectorEnv"
+gym = cache(envs.GymRobotEnv)
+vector = cache(lambda: envs.GymRobotVectorEnv(num_envs=3, num_threads=1, autoreset_mode="Disabled"))
+many = partial(envs.GymRobotVectorEnv, num_envs=3, num_threads=1)
+for make, interface, shape in ((gym, envs.GymRobotEnv, (2,)), (vector, many, (3, 2))):
+    owner = "GymRobotEnv" if make is gym else "GymRobotVectorEnv"
     make().reset(seed=0)
     state = lambda make=make: make()._core.snapshot()  # noqa: E731
-    each(owner, face, "robot", ("unicycle",), ROBOT)
-    each(owner, face, "episode_length", (0,), "an integer >= 1")
-    each(owner, face, "render_mode", ("ascii",), "None or one of ['rgb_array'")
+    each(owner, interface, "robot", ("unicycle",), ROBOT)
+    each(owner, interface, "episode_length", (0,), "an integer >= 1")
+    each(owner, interface, "render_mode", ("ascii",), "None or one of ['rgb_array'")
     for name, action, *says in (
         ("shape", np.zeros(5), "(5,)", f"shape {shape}"),
         ("kind", np.full(shape, "x"), "<U1", "must be numbers"),
@@ -1255,10 +1276,10 @@ for make, face, shape in ((gym, envs.GymGoalEnv, (2,)), (vector, many, (3, 2))):
         ">= 0",
         state=state,
     )
-each("GymGoalVectorEnv", many, "autoreset_mode", ("Never",), "'NextStep'")
-each("GymGoalVectorEnv", many, "num_envs", (0,), "an integer >= 1")
+each("GymRobotVectorEnv", many, "autoreset_mode", ("Never",), "'NextStep'")
+each("GymRobotVectorEnv", many, "num_envs", (0,), "an integer >= 1")
 bad(
-    "GymGoalVectorEnv.reset: seeds",
+    "GymRobotVectorEnv.reset: seeds",
     lambda: vector().reset(seed=[1, 2]),
     ValueError,
     "seed",
@@ -1267,7 +1288,7 @@ bad(
     state=lambda: vector()._core.snapshot(),
 )
 bad(
-    "GymGoalVectorEnv.reset: mask",
+    "GymRobotVectorEnv.reset: mask",
     lambda: vector().reset(options={"reset_mask": np.zeros(2)}),
     ValueError,
     "reset_mask",
@@ -1287,7 +1308,7 @@ control = cache(lambda: suite.load(random=0))
 control().reset()
 control_state = lambda: control().task._core.snapshot()  # noqa: E731
 each("suite.load", suite.load, "robot", ("unicycle",), ROBOT)
-each("suite.load", suite.load, "task", ("push",), "'goal' or a Task")
+each("suite.load", suite.load, "task", ("push",), "one of goal, navigation")
 each("suite.load", suite.load, "episode_length", (0,), "an integer >= 1")
 each("suite.load", suite.load, "random", (-1,), ">= 0")
 bad(

@@ -14,7 +14,7 @@ from scipy.stats import kstwobign, norm
 from torchrl_safe.envs import GoalTask, NavigationTask, SafeGoalEnv, get_robot
 from torchrl_safe.modules import TanhGaussianMixture
 from torchrl_safe.objectives.functional import cvar_factor, gaussian_cvar, q_logarithm
-from torchrl_safe.objectives.value import retrace_lambda_return_estimate
+from torchrl_safe.objectives.value import trace_lambda_return_estimate
 
 settings.register_profile(
     "reproducible",
@@ -166,16 +166,16 @@ class TestRetrace:
             (one[key] - other[key]).abs().max().item()
             for key in ("action_value", "next_state_value")
         )
-        targets = [retrace_lambda_return_estimate(gamma, lmbda, **d) for d in (one, other)]
+        targets = [trace_lambda_return_estimate(gamma, lmbda, **d) for d in (one, other)]
         assert (targets[0] - targets[1]).abs().max().item() <= gamma * apart + 1e-9
 
     @given(*CASES)
     def test_rows_do_not_see_each_other(self, seed, batch, steps, gamma, lmbda):
         data = self.make(seed, batch, steps)
-        whole = retrace_lambda_return_estimate(gamma, lmbda, **data)
+        whole = trace_lambda_return_estimate(gamma, lmbda, **data)
         for i in range(batch):
             row = {key: value[i] for key, value in data.items()}
-            alone = retrace_lambda_return_estimate(gamma, lmbda, **row)
+            alone = trace_lambda_return_estimate(gamma, lmbda, **row)
             torch.testing.assert_close(whole[i], alone, rtol=1e-9, atol=1e-9)
 
     @given(*CASES, st.integers(1, 19))
@@ -183,10 +183,10 @@ class TestRetrace:
         assume(at < steps)
         data = self.make(seed, batch, steps)
         data["done"][:, at - 1] = True
-        whole = retrace_lambda_return_estimate(gamma, lmbda, **data)
+        whole = trace_lambda_return_estimate(gamma, lmbda, **data)
         for part in (slice(None, at), slice(at, None)):
             cut = {key: value[:, part] for key, value in data.items()}
-            alone = retrace_lambda_return_estimate(gamma, lmbda, **cut)
+            alone = trace_lambda_return_estimate(gamma, lmbda, **cut)
             torch.testing.assert_close(whole[:, part], alone, rtol=1e-9, atol=1e-9)
 
 

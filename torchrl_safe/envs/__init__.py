@@ -1,34 +1,40 @@
-"""Environments with a cost: robots, tasks, and their TorchRL, Gymnasium and dm_control faces.
+"""Environments with a cost: robots and tasks, and what a cost needs in anybody's environment.
 
 Importing this package registers the environments with Gymnasium. MuJoCo is imported by the first
 environment of ours that is asked for: adapters, transforms and checks, which serve any environment,
-do without. The dm_control face is imported by those who use it: ``from torchrl_safe.envs import
-suite``.
+do without. :mod:`torchrl_safe.envs.interfaces` has the same environments for users of Gymnasium and
+dm_control.
 """
 
 from __future__ import annotations
 
+from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from torchrl_safe.envs._moved import MODULES, NAMES, keep_old_paths, warn_moved
 from torchrl_safe.envs.adapters import CostToReward, cost_from_info
 from torchrl_safe.envs.checks import check_safe_env
+from torchrl_safe.envs.interfaces.registration import register_envs
 from torchrl_safe.envs.randomization import (
     JACKAL_REAL,
     JACKAL_TRAINING,
     RANDOMIZATIONS,
     Randomization,
 )
-from torchrl_safe.envs.registration import register_envs
 from torchrl_safe.envs.robots import ROBOTS, Robot, get_robot
 from torchrl_safe.envs.tasks import GoalTask, NavigationTask
 from torchrl_safe.envs.tasks.velocity import VELOCITY_TASKS, VelocityTask, get_velocity_task
 from torchrl_safe.envs.transforms import SafeFrameSkip
 
 if TYPE_CHECKING:
-    from torchrl_safe.envs.goal import SafeGoalEnv
-    from torchrl_safe.envs.gymnasium import GymGoalEnv, GymGoalVectorEnv
-    from torchrl_safe.envs.velocity import SafeVelocityEnv
-    from torchrl_safe.envs.velocity_gymnasium import GymVelocityEnv, GymVelocityVectorEnv
+    from torchrl_safe.envs.interfaces.gymnasium import (
+        GymRobotEnv,
+        GymRobotVectorEnv,
+        GymVelocityEnv,
+        GymVelocityVectorEnv,
+    )
+    from torchrl_safe.envs.robot_env import SafeGoalEnv, SafeRobotEnv
+    from torchrl_safe.envs.velocity_env import SafeVelocityEnv
 
 __all__ = [
     "JACKAL_REAL",
@@ -38,8 +44,8 @@ __all__ = [
     "VELOCITY_TASKS",
     "CostToReward",
     "GoalTask",
-    "GymGoalEnv",
-    "GymGoalVectorEnv",
+    "GymRobotEnv",
+    "GymRobotVectorEnv",
     "GymVelocityEnv",
     "GymVelocityVectorEnv",
     "NavigationTask",
@@ -47,6 +53,7 @@ __all__ = [
     "Robot",
     "SafeFrameSkip",
     "SafeGoalEnv",
+    "SafeRobotEnv",
     "SafeVelocityEnv",
     "VelocityTask",
     "check_safe_env",
@@ -57,11 +64,18 @@ __all__ = [
 
 
 def __getattr__(name: str) -> Any:
+    if name in MODULES:
+        warn_moved(f"{__name__}.{name}", MODULES[name])
+        return import_module(MODULES[name])
+    if name in NAMES:
+        warn_moved(f"{__name__}.{name}", f"{__name__}.{NAMES[name]}")
+        name = NAMES[name]
     if name not in __all__:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    from torchrl_safe.envs import goal, gymnasium, velocity, velocity_gymnasium
+    from torchrl_safe.envs import robot_env, velocity_env
+    from torchrl_safe.envs.interfaces import gymnasium
 
-    modules = (goal, gymnasium, velocity, velocity_gymnasium)
+    modules = (robot_env, velocity_env, gymnasium)
     return getattr(next(module for module in modules if name in module.__all__), name)
 
 
@@ -70,3 +84,4 @@ def __dir__() -> list[str]:
 
 
 register_envs()
+keep_old_paths(__name__)

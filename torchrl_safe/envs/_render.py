@@ -15,8 +15,8 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from torchrl_safe.envs._core import Core
 from torchrl_safe.envs._process import keep_forever
+from torchrl_safe.envs._robot import RobotCore
 from torchrl_safe.envs.robots import Array
 from torchrl_safe.envs.tasks import Prop
 
@@ -37,7 +37,7 @@ class SceneRenderer:
     What it draws with is opened at the first picture. Copies and pickles open their own.
 
     Args:
-        core (Core): the environments.
+        core (RobotCore): the environments.
         width (int): pixels, W.
         height (int): pixels, H.
         window (bool): draw in a window instead of in memory.
@@ -46,7 +46,7 @@ class SceneRenderer:
         ValueError: if the size is not positive.
     """
 
-    def __init__(self, core: Core, width: int, height: int, *, window: bool = False) -> None:
+    def __init__(self, core: RobotCore, width: int, height: int, *, window: bool = False) -> None:
         if width < 1 or height < 1:
             raise ValueError(f"width and height must be positive, got {width} and {height}.")
         self.size = (width, height)
@@ -79,7 +79,7 @@ class SceneRenderer:
 class _Canvas:
     """An open OpenGL context and the scene it shows."""
 
-    def __init__(self, core: Core, width: int, height: int, *, window: bool) -> None:
+    def __init__(self, core: RobotCore, width: int, height: int, *, window: bool) -> None:
         self._size = (width, height)
         self._core = core
         self._window = window
@@ -127,7 +127,7 @@ class _Canvas:
         with _visit():
             self._gl.make_current()
             mujoco.mjr_render(viewport, self._view, self._context)
-            cost, violation = core.frame.cost[index], core.frame.violation[index]
+            cost, violation = core.frame.cost[index].sum(), core.frame.violation[index].any()
             mujoco.mjr_overlay(
                 mujoco.mjtFont.mjFONT_NORMAL,
                 mujoco.mjtGridPos.mjGRID_TOPLEFT,
@@ -156,7 +156,7 @@ class Scene:
     """The model that is drawn: the robot's own, dressed with floor, light and the task's objects.
 
     Args:
-        core (Core): the environments.
+        core (RobotCore): the environments.
         width (int): the widest picture, pixels.
         height (int): the highest picture, pixels.
 
@@ -165,7 +165,7 @@ class Scene:
         data (mujoco.MjData): what :meth:`show` wrote.
     """
 
-    def __init__(self, core: Core, width: int = 640, height: int = 480) -> None:
+    def __init__(self, core: RobotCore, width: int = 640, height: int = 480) -> None:
         self._core = core
         spec, props, hazards = _scene_spec(core, width, height)
         self.model = spec.compile()
@@ -190,7 +190,7 @@ class Scene:
         mujoco.mj_camlight(model, data)
         if self._hazards:
             model.geom_rgba[self._hazards] = self._colours
-            if core.frame.violation[index]:
+            if core.frame.violation[index].any():
                 offset = data.geom_xpos[self._hazards, :2] - layout["robot"]
                 nearest = np.hypot(*offset.T).argmin()
                 model.geom_rgba[self._hazards[nearest]] = _RED
@@ -211,7 +211,9 @@ class Scene:
         return layout["robot"] + ahead @ np.array([[x, y], [-y, x]])
 
 
-def _scene_spec(core: Core, width: int, height: int) -> tuple[mujoco.MjSpec, list[str], list[str]]:
+def _scene_spec(
+    core: RobotCore, width: int, height: int
+) -> tuple[mujoco.MjSpec, list[str], list[str]]:
     """What is drawn, and the names of the objects' bodies and of the hazards' geoms.
 
     A robot's file may use any name, and defaults that would change what is added here.
@@ -308,7 +310,7 @@ def _places(prop: Prop, layout: dict[str, Array]) -> Array:
     return places.reshape(-1, 2)
 
 
-def _camera_distance(core: Core) -> float:
+def _camera_distance(core: RobotCore) -> float:
     # Far enough to see the square and the objects at its rim.
     return 2.8 * core.task.extent
 

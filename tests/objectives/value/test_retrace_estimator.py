@@ -48,7 +48,7 @@ from torchrl.objectives import (
 from torchrl.objectives.value import TD0Estimator, TDLambdaEstimator
 from torchrl.testing import get_default_devices
 
-from torchrl_safe.objectives.value import RetraceEstimator, retrace_lambda_return_estimate
+from torchrl_safe.objectives.value import RetraceEstimator, trace_lambda_return_estimate
 
 RETRACE = "retrace"
 GAMMA, LMBDA = 0.99, 0.9
@@ -115,7 +115,7 @@ def reference(data: TensorDictBase, lmbda: float = LMBDA, gamma: float = GAMMA, 
     for name in ("log_pi", "log_mu"):
         inputs[name] = inputs[name].reshape(*data.batch_size, 1)
     flags = {name: data["next", name] for name in ("reward", "done", "terminated")}
-    return retrace_lambda_return_estimate(gamma, lmbda, **inputs, **flags)
+    return trace_lambda_return_estimate(gamma, lmbda, **inputs, **flags)
 
 
 class Forbidden(nn.Module):
@@ -237,7 +237,6 @@ def test_params_and_target_params() -> None:
 CHUNKS = [
     {"value_chunk_size": 2},
     {"num_chunks": 3},
-    {"num_chunk": 3},
     {"value_chunk_size": 3, "value_chunk_dim": 1},
     {"num_chunks": 3, "value_chunk_dim": 1},
 ]
@@ -293,8 +292,6 @@ def test_chunk_settings_exclude_each_other() -> None:
     settings = {"gamma": GAMMA, "lmbda": LMBDA, "qvalue_network": make_critic()}
     with pytest.raises(ValueError, match="value_chunk_size and num_chunks"):
         RetraceEstimator(**settings, value_chunk_size=3, num_chunks=2)
-    with pytest.raises(ValueError, match="num_chunks and num_chunk"):
-        RetraceEstimator(**settings, num_chunk=3, num_chunks=2)
     estimator = RetraceEstimator(**settings, num_chunks=2, value_chunk_dim=2)
     with pytest.raises(ValueError, match="value_chunk_dim"):
         estimator(make_precomputed(4, 7))
@@ -507,12 +504,6 @@ def test_settings_are_not_state() -> None:
 def test_bad_coefficients(name: str, value: float | Tensor) -> None:
     with pytest.raises(ValueError, match=rf"{name} must be one number in \[0, 1\]"):
         RetraceEstimator(**{"gamma": GAMMA, "lmbda": LMBDA, name: value})
-
-
-@pytest.mark.parametrize("name", ["advantage_key", "value_target_key", "value_key"])
-def test_deprecated_keys(name: str) -> None:
-    with pytest.raises(RuntimeError, match=f"'{name}' via constructor is deprecated"):
-        RetraceEstimator(gamma=GAMMA, lmbda=LMBDA, **{name: "key"})
 
 
 @pytest.mark.parametrize(

@@ -10,9 +10,8 @@ import torch
 
 from torchrl_safe.objectives.value import (
     distributional_retrace_estimate,
-    q_lambda_return_estimate,
-    retrace_lambda_return_estimate,
     sampled_lambda_return_estimate,
+    trace_lambda_return_estimate,
 )
 
 GAMMA = 0.9
@@ -162,8 +161,9 @@ class TestOnPolicy:
         done = rand(3, 7, 1) < 0.3
         terminated = done & (rand(3, 7, 1) < 0.5)
         value_of_state = torch.cat([torch.zeros(3, 1, 1), value[:, :-1]], 1)
-        expected = q_lambda_return_estimate(
-            GAMMA, 0.7, value_of_state, value, cost, done, terminated
+        expected = trace_lambda_return_estimate(
+            *(GAMMA, 0.7, None, None, value_of_state, value, cost, done, terminated),
+            trace="q_lambda",
         )
         samples = sampled_lambda_return_estimate(
             GAMMA, 0.7, value.expand(3, 7, 100_000), cost, done, terminated, generator=generator
@@ -263,7 +263,7 @@ class TestOffPolicy:
             )
         )
         mean = (values * weights).sum(-1, keepdim=True)
-        expected = retrace_lambda_return_estimate(
+        expected = trace_lambda_return_estimate(
             gamma,
             lmbda,
             log_pi,

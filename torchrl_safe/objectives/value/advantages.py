@@ -26,7 +26,7 @@ from torchrl.objectives.value.advantages import (
     _standardize_by_group,
 )
 
-from torchrl_safe.objectives.value.functional import retrace_lambda_return_estimate
+from torchrl_safe.objectives.value.functional import trace_lambda_return_estimate
 from torchrl_safe.objectives.value.utils import (
     behaviour_log_prob,
     get_entry,
@@ -44,7 +44,7 @@ __all__ = ["RetraceEstimator"]
 class RetraceEstimator(ValueEstimatorBase):
     r"""Retrace(:math:`\lambda`) estimate of an action value from off-policy trajectories.
 
-    The target is that of :func:`~torchrl_safe.objectives.value.retrace_lambda_return_estimate`,
+    The target is that of :func:`~torchrl_safe.objectives.value.trace_lambda_return_estimate`,
     SafeTAC (18), after Munos et al., 2016 (https://arxiv.org/abs/1606.02647). The estimator gathers
     its arguments from a tensordict of trajectories ``[*B, T]``:
 
@@ -107,9 +107,6 @@ class RetraceEstimator(ValueEstimatorBase):
         vectorized (bool): see the functional. Defaults to ``True``, also when compiling.
         skip_existing (bool, optional): use entries that are present in place of networks. Defaults
             to ``None``, that is :func:`tensordict.nn.skip_existing`.
-        advantage_key (NestedKey, optional): deprecated, raises; use :meth:`set_keys`.
-        value_target_key (NestedKey, optional): deprecated, raises; use :meth:`set_keys`.
-        value_key (NestedKey, optional): deprecated, raises; use :meth:`set_keys`.
         shifted (bool): :meth:`forward` runs the networks once over ``T + shifted_budget`` states,
             taking the next observation of a step from the step that follows, in place of twice over
             ``T``. Truncations use up the budget; steps that no longer fit are zero in the outputs
@@ -124,7 +121,6 @@ class RetraceEstimator(ValueEstimatorBase):
         value_chunk_size (int, optional): largest number of elements, along ``value_chunk_dim``, of
             one call of the critic.
         num_chunks (int, optional): number of calls of the critic; excludes ``value_chunk_size``.
-        num_chunk (int, optional): alias of ``num_chunks``.
         value_chunk_dim (int): dimension along which calls are split. Defaults to ``0``.
 
     Raises:
@@ -278,16 +274,12 @@ class RetraceEstimator(ValueEstimatorBase):
         differentiable: bool = False,
         vectorized: bool = True,
         skip_existing: bool | None = None,
-        advantage_key: NestedKey | None = None,
-        value_target_key: NestedKey | None = None,
-        value_key: NestedKey | None = None,
         shifted: bool = False,
         device: torch.device | None = None,
         time_dim: int | None = None,
         deactivate_vmap: bool = False,
         value_chunk_size: int | None = None,
         num_chunks: int | None = None,
-        num_chunk: int | None = None,
         value_chunk_dim: int = 0,
         shifted_budget: int = 1,
         group_key: NestedKey | None = None,
@@ -297,14 +289,10 @@ class RetraceEstimator(ValueEstimatorBase):
             shifted=shifted,
             differentiable=differentiable,
             skip_existing=skip_existing,
-            advantage_key=advantage_key,
-            value_target_key=value_target_key,
-            value_key=value_key,
             device=device,
             deactivate_vmap=deactivate_vmap,
             value_chunk_size=value_chunk_size,
             num_chunks=num_chunks,
-            num_chunk=num_chunk,
             value_chunk_dim=value_chunk_dim,
             shifted_budget=shifted_budget,
             group_key=group_key,
@@ -503,7 +491,7 @@ class RetraceEstimator(ValueEstimatorBase):
                 (("next", keys.terminated), terminated),
             )
         )
-        return retrace_lambda_return_estimate(
+        return trace_lambda_return_estimate(
             gamma,
             self.lmbda,
             log_pi,

@@ -13,8 +13,8 @@ from torchrl_safe.objectives.value.functional import (
     _check_shape,
     _check_time_dim,
     _coefficient,
-    _log_ratio,
-    q_lambda_return_estimate,
+    _log_trace,
+    trace_lambda_return_estimate,
 )
 
 __all__ = ["distributional_retrace_estimate", "sampled_lambda_return_estimate"]
@@ -105,14 +105,17 @@ def sampled_lambda_return_estimate(
     ends = torch.cat([earlier, torch.ones_like(last)], time_dim)
     next_samples = torch.where(ends, next_samples, 0)
     nothing = torch.zeros_like(next_samples)
-    return q_lambda_return_estimate(
+    return trace_lambda_return_estimate(
         gamma,
         1.0,
+        None,
+        None,
         nothing,
         next_samples,
         reward.to(next_samples.dtype).expand(shape),
         ends,
         terminated.expand(shape),
+        trace="q_lambda",
         time_dim=time_dim,
     )
 
@@ -146,7 +149,7 @@ def distributional_retrace_estimate(
     Weights of a trajectory are therefore negative, too; averaged over what the other policy does
     they are those of a distribution, whose only fixed point is that of :math:`\pi`. Their sum is 1
     in every trajectory. The mean is that of
-    :func:`~torchrl_safe.objectives.value.retrace_lambda_return_estimate`.
+    :func:`~torchrl_safe.objectives.value.trace_lambda_return_estimate`.
 
     The number of samples grows with the length of the slices: this is for slices of tens of steps.
 
@@ -203,7 +206,7 @@ def distributional_retrace_estimate(
     _coefficient("lmbda", lmbda, ())
     dtype = samples.dtype
     ends = done | terminated
-    trace = lmbda * _log_ratio(log_pi, log_mu, reward).clamp(max=0).exp()
+    trace = lmbda * _log_trace("retrace", log_pi, log_mu, reward).exp()
     discount = torch.as_tensor(gamma, dtype=dtype, device=samples.device).expand(shape)
     trace, discount, reward, ends, terminated = (
         x.movedim(time_dim, -2).squeeze(-1) for x in (trace, discount, reward, ends, terminated)

@@ -1,44 +1,46 @@
-"""Off-policy multi-step targets: one pure function per equation.
-
-The four targets of Munos et al., 2016 (https://arxiv.org/abs/1606.02647, table 1) differ in the
-coefficient of one recursion, :func:`_trace_return_estimate`.
-"""
+"""Off-policy multi-step targets: one pure function per equation."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import torch
 from torch import Tensor
 
 __all__ = [
-    "importance_sampling_lambda_return_estimate",
-    "q_lambda_return_estimate",
-    "retrace_lambda_return_estimate",
     "retrace_variance_reward",
     "squared_td_error",
-    "tree_backup_lambda_return_estimate",
+    "trace_lambda_return_estimate",
     "visited_value_estimate",
 ]
+
+# How many of log_pi and log_mu a trace reads, and the logarithm of its coefficient over lmbda.
+_LOG_TRACES: dict[str, tuple[int, Callable[[Tensor, Tensor], Tensor]]] = {
+    "retrace": (2, lambda log_pi, log_mu: (log_pi - log_mu).clamp(max=0)),
+    "importance_sampling": (2, lambda log_pi, log_mu: log_pi - log_mu),
+    "tree_backup": (1, lambda log_pi, _: log_pi),
+    "q_lambda": (0, lambda log_pi, _: torch.zeros_like(log_pi)),
+}
 
 _MAX_BLOCKS = 16  # of a recurrence; fewer are more rounds over all steps, more are many small steps
 
 
-def retrace_lambda_return_estimate(
+def trace_lambda_return_estimate(
     gamma: float | Tensor,
     lmbda: float | Tensor,
-    log_pi: Tensor,
-    log_mu: Tensor,
+    log_pi: Tensor | None,
+    log_mu: Tensor | None,
     action_value: Tensor,
     next_state_value: Tensor,
     reward: Tensor,
     done: Tensor,
     terminated: Tensor | None = None,
     *,
+    trace: str = "retrace",
     vectorized: bool = True,
     time_dim: int = -2,
 ) -> Tensor:
-    r"""Retrace(:math:`\lambda`) target of an action value.
+    r"""Off-policy target of an action value: Retrace(:math:`\lambda`), or with another trace.
 
     From "Safe and efficient off-policy reinforcement learning", Munos et al., 2016
     (https://arxiv.org/abs/1606.02647), in the form of SafeTAC (18):
@@ -46,8 +48,18 @@ def retrace_lambda_return_estimate(
     .. math::
 
         Q^{ret}_t = r_t + \gamma (1 - term_t) V(s_{t+1})
-            + \gamma (1 - done_t) c_{t+1} \left(Q^{ret}_{t+1} - Q(s_{t+1}, a_{t+1})\right),
-        \qquad c_t = \lambda \min\left(1, \frac{\pi(a_t | s_t)}{\mu(a_t | s_t)}\right).
+            + \gamma (1 - done_t) c_{t+1} \left(Q^{ret}_{t+1} - Q(s_{t+1}, a_{t+1})\right).
+
+    The trace coefficient :math:`c_t` is what the targets of their table 1 differ in:
+
+    * ``"retrace"``: :math:`\lambda \min(1, \pi(a_t|s_t) / \mu(a_t|s_t))`;
+    * ``"importance_sampling"``: :math:`\lambda \pi(a_t|s_t) / \mu(a_t|s_t)`, unbiased at
+      :math:`\lambda = 1`, but of a variance without bound;
+    * ``"tree_backup"``: :math:`\lambda \pi(a_t|s_t)`, of discrete actions (a density is no trace
+      coefficient), without a behaviour policy (Precup et al., 2000);
+    * ``"q_lambda"``: :math:`\lambda`, without any density (Harutyunyan et al., 2016,
+      https://arxiv.org/abs/1602.04951), safe only where the two policies are close or
+      :math:`\lambda` is small.
 
     Every argument is aligned with its own step ``t``; the shift to ``t + 1`` is made within.
     ``done`` cuts the trace and ``terminated`` masks the bootstrap: a truncated step, wherever it
@@ -61,10 +73,10 @@ def retrace_lambda_return_estimate(
         gamma (float or Tensor): discount in [0, 1]. A tensor has one element, or as many
             dimensions as ``reward`` and broadcasts to it (a discount per step).
         lmbda (float or Tensor): trace decay in [0, 1]; tensors as for ``gamma``.
-        log_pi (Tensor): log-density of the stored action under the current policy,
-            ``[*B, T, 1]``, shared by all features.
-        log_mu (Tensor): log-density of the stored action under the policy that took it,
-            ``[*B, T, 1]``.
+        log_pi (Tensor or None): log-density of the stored action under the current policy,
+            ``[*B, T, 1]``, shared by all features. Not read by ``"q_lambda"``.
+        log_mu (Tensor or None): log-density of the stored action under the policy that took it,
+            ``[*B, T, 1]``. Read by ``"retrace"`` and ``"importance_sampling"``.
         action_value (Tensor): :math:`Q(s_t, a_t)`, ``[*B, T, F]``.
         next_state_value (Tensor): :math:`V(s_{t+1})`, the value of the next state under the
             current policy, ``[*B, T, F]``. Not read where ``terminated`` (may be NaN there).
@@ -74,6 +86,7 @@ def retrace_lambda_return_estimate(
         terminated (Tensor, optional): boolean end of episode, ``[*B, T, F]``. Defaults to ``done``.
 
     Keyword Args:
+        trace (str): one of the four. Defaults to ``"retrace"``.
         vectorized (bool): go back in no more than 16 blocks of steps, which takes a few rounds of
             tensor operations on all steps first. ``False`` goes back one step at a time, with less
             memory. Defaults to ``True``.
@@ -85,8 +98,9 @@ def retrace_lambda_return_estimate(
 
     Raises:
         TypeError: if ``done`` or ``terminated`` is not boolean.
-        ValueError: if shapes disagree, if ``time_dim`` is not one of the dimensions before the
-            last, or if a coefficient given as a number is outside [0, 1].
+        ValueError: if ``trace`` is none of the four, a density that it reads is ``None``, shapes
+            disagree, ``time_dim`` is not one of the dimensions before the last, or a coefficient
+            given as a number is outside [0, 1].
 
     Examples:
         The second of three steps is truncated. It bootstraps and is worth 2 + 10 / 2; the first
@@ -98,151 +112,54 @@ def retrace_lambda_return_estimate(
         >>> terminated = torch.zeros_like(done)
         >>> value, next_value = torch.zeros(3, 1), torch.full((3, 1), 10.0)
         >>> log_pi, log_mu = torch.tensor([[0.5], [0.25], [8.0]]).log(), torch.zeros(3, 1)
-        >>> target = retrace_lambda_return_estimate(
+        >>> target = trace_lambda_return_estimate(
         ...     0.5, 1.0, log_pi, log_mu, value, next_value, reward, done, terminated
         ... )
         >>> target.squeeze(-1)
         tensor([6.8750, 7.0000, 9.0000])
-
-    """
-    log_ratio = _log_ratio(log_pi, log_mu, reward).clamp(max=0)
-    return _trace_return_estimate(
-        gamma,
-        lmbda,
-        log_ratio,
-        action_value,
-        next_state_value,
-        reward,
-        done,
-        terminated,
-        vectorized=vectorized,
-        time_dim=time_dim,
-    )
-
-
-def importance_sampling_lambda_return_estimate(
-    gamma: float | Tensor,
-    lmbda: float | Tensor,
-    log_pi: Tensor,
-    log_mu: Tensor,
-    action_value: Tensor,
-    next_state_value: Tensor,
-    reward: Tensor,
-    done: Tensor,
-    terminated: Tensor | None = None,
-    *,
-    vectorized: bool = True,
-    time_dim: int = -2,
-) -> Tensor:
-    r"""Target with per-decision importance sampling, :math:`c_t = \lambda \pi / \mu`.
-
-    Unbiased at :math:`\lambda = 1` (Munos et al., 2016, table 1), but its variance has no bound.
-    Arguments, result and errors are those of :func:`retrace_lambda_return_estimate`.
-
-    Examples:
-        >>> import torch
-        >>> log_pi, zeros = torch.tensor([[0.0], [3.0]]).log(), torch.zeros(2, 1)
-        >>> importance_sampling_lambda_return_estimate(
-        ...     1.0, 1.0, log_pi, zeros, zeros, zeros, torch.ones(2, 1), zeros.bool()
+        >>> trace_lambda_return_estimate(
+        ...     *(0.5, 1.0, None, None, value, next_value, reward, done, terminated),
+        ...     trace="q_lambda",
         ... ).squeeze(-1)
-        tensor([4., 1.])
+        tensor([9.5000, 7.0000, 9.0000])
 
     """
-    return _trace_return_estimate(
-        gamma,
-        lmbda,
-        _log_ratio(log_pi, log_mu, reward),
-        action_value,
-        next_state_value,
-        reward,
-        done,
-        terminated,
-        vectorized=vectorized,
-        time_dim=time_dim,
+    terminated = done if terminated is None else terminated
+    shape = reward.shape
+    _check_time_dim(time_dim, shape, "reward")
+    _check_shape("action_value", action_value, shape, "that of reward")
+    _check_shape("next_state_value", next_state_value, shape, "that of reward")
+    _check_shape("done", done, shape, "that of reward")
+    _check_shape("terminated", terminated, shape, "that of reward")
+    _check_boolean("done", done)
+    _check_boolean("terminated", terminated)
+    log_trace = _log_trace(trace, log_pi, log_mu, reward)
+    gamma = _coefficient("gamma", gamma, shape)
+    lmbda = _coefficient("lmbda", lmbda, shape)
+
+    # A count or a flag is a reward, too; its targets are no integers.
+    dtype = (reward if reward.is_floating_point() else next_state_value).dtype
+    reward = reward.to(dtype)
+    if dtype in (torch.bfloat16, torch.float16):
+        log_trace, action_value, next_state_value, reward = (
+            tensor.float() for tensor in (log_trace, action_value, next_state_value, reward)
+        )
+    target = reward + gamma * torch.where(terminated, 0, next_state_value)
+    decay = gamma * lmbda
+    if isinstance(decay, Tensor) and decay.ndim:
+        decay = decay.expand(shape).movedim(time_dim, 0)[:-1]
+    log_trace, action_value, target, done = (
+        tensor.movedim(time_dim, 0) for tensor in (log_trace, action_value, target, done)
     )
-
-
-def tree_backup_lambda_return_estimate(
-    gamma: float | Tensor,
-    lmbda: float | Tensor,
-    log_pi: Tensor,
-    action_value: Tensor,
-    next_state_value: Tensor,
-    reward: Tensor,
-    done: Tensor,
-    terminated: Tensor | None = None,
-    *,
-    vectorized: bool = True,
-    time_dim: int = -2,
-) -> Tensor:
-    r"""Tree-Backup(:math:`\lambda`) target of discrete actions, :math:`c_t = \lambda \pi(a_t|s_t)`.
-
-    Needs no behaviour policy (Munos et al., 2016, table 1; Precup et al., 2000). ``log_pi`` is the
-    logarithm of a probability: a density is no trace coefficient. The other arguments, result and
-    errors are those of :func:`retrace_lambda_return_estimate`.
-
-    Examples:
-        >>> import torch
-        >>> log_pi, zeros = torch.tensor([[0.5], [0.5]]).log(), torch.zeros(2, 1)
-        >>> tree_backup_lambda_return_estimate(
-        ...     1.0, 1.0, log_pi, zeros, zeros, torch.ones(2, 1), zeros.bool()
-        ... ).squeeze(-1)
-        tensor([1.5000, 1.0000])
-
-    """
-    return _trace_return_estimate(
-        gamma,
-        lmbda,
-        log_pi,
-        action_value,
-        next_state_value,
-        reward,
-        done,
-        terminated,
-        vectorized=vectorized,
-        time_dim=time_dim,
-    )
-
-
-def q_lambda_return_estimate(
-    gamma: float | Tensor,
-    lmbda: float | Tensor,
-    action_value: Tensor,
-    next_state_value: Tensor,
-    reward: Tensor,
-    done: Tensor,
-    terminated: Tensor | None = None,
-    *,
-    vectorized: bool = True,
-    time_dim: int = -2,
-) -> Tensor:
-    r"""Q(:math:`\lambda`) target with off-policy corrections, :math:`c_t = \lambda`.
-
-    Needs no policy's density (Harutyunyan et al., 2016, https://arxiv.org/abs/1602.04951; Munos et
-    al., 2016, table 1), but is safe only where the two policies are close or :math:`\lambda` is
-    small. The arguments, result and errors are those of :func:`retrace_lambda_return_estimate`.
-
-    Examples:
-        >>> import torch
-        >>> zeros = torch.zeros(2, 1)
-        >>> q_lambda_return_estimate(
-        ...     1.0, 0.5, zeros, zeros, torch.ones(2, 1), zeros.bool()
-        ... ).squeeze(-1)
-        tensor([1.5000, 1.0000])
-
-    """
-    return _trace_return_estimate(
-        gamma,
-        lmbda,
-        torch.zeros_like(reward[..., :1]),
-        action_value,
-        next_state_value,
-        reward,
-        done,
-        terminated,
-        vectorized=vectorized,
-        time_dim=time_dim,
-    )
+    # Across a cut ratio and value are another trajectory's: masking them before they are used stops
+    # their gradients too, and a NaN in either.
+    coefficient = torch.where(done[:-1], -torch.inf, log_trace[1:]).exp() * decay
+    following = torch.where(done[:-1], 0, action_value[1:])
+    head = torch.addcmul(target[:-1], coefficient, following, value=-1)
+    # A coefficient that is no number has made one of its step's head; products would carry it on.
+    coefficient = coefficient.nan_to_num(nan=0.0, posinf=0.0)
+    solution = _solve_recurrence(coefficient, torch.cat([head, target[-1:]]), vectorized)
+    return solution.movedim(0, time_dim).contiguous().to(dtype)
 
 
 def retrace_variance_reward(
@@ -262,7 +179,7 @@ def retrace_variance_reward(
         \left(c_t + \gamma (1 - term_t) Q_C(s_{t+1}, a'_{t+1})\right)^2 - Q_C(s_t, a_t)^2,
         \qquad a'_{t+1} \sim \pi(\cdot | s_{t+1}).
 
-    Its variance target therefore is :func:`retrace_lambda_return_estimate` with
+    Its variance target therefore is :func:`trace_lambda_return_estimate` with
     ``gamma**2``, this reward, and the variance critic's values.
 
     .. note::
@@ -295,7 +212,7 @@ def retrace_variance_reward(
         >>> mean, log_prob = torch.ones(2, 1), torch.zeros(2, 1)
         >>> variance = next_variance = torch.zeros(2, 1)
         >>> reward = retrace_variance_reward(gamma, cost, mean, mean, done)
-        >>> retrace_lambda_return_estimate(
+        >>> trace_lambda_return_estimate(
         ...     gamma**2, lmbda, log_prob, log_prob, variance, next_variance, reward, done
         ... ).mean()
         tensor(1.)
@@ -427,8 +344,10 @@ def visited_value_estimate(
 
     def sums(reward: Tensor, value: Tensor) -> Tensor:
         nothing = torch.zeros_like(reward)
-        return q_lambda_return_estimate(
-            gamma, 1.0, nothing, value, reward, ends, terminated, time_dim=time_dim
+        return trace_lambda_return_estimate(
+            *(gamma, 1.0, None, None, nothing, value, reward, ends, terminated),
+            trace="q_lambda",
+            time_dim=time_dim,
         )
 
     def mean(tensor: Tensor, where: Tensor) -> Tensor:
@@ -468,60 +387,20 @@ def _one_step_cost(
     return cost + gamma * torch.where(terminated, 0, next_action_value)
 
 
-def _log_ratio(log_pi: Tensor, log_mu: Tensor, reward: Tensor) -> Tensor:
-    for name, tensor in (("log_pi", log_pi), ("log_mu", log_mu)):
-        _check_shape(name, tensor, (*reward.shape[:-1], 1), "that of reward with one feature")
-    return log_pi - log_mu
-
-
-def _trace_return_estimate(
-    gamma: float | Tensor,
-    lmbda: float | Tensor,
-    log_trace: Tensor,
-    action_value: Tensor,
-    next_state_value: Tensor,
-    reward: Tensor,
-    done: Tensor,
-    terminated: Tensor | None,
-    *,
-    vectorized: bool,
-    time_dim: int,
-) -> Tensor:
-    """The recursion of all targets; the trace coefficient is ``lmbda * exp(log_trace)``."""
-    terminated = done if terminated is None else terminated
-    shape = reward.shape
-    _check_time_dim(time_dim, shape, "reward")
-    _check_shape("action_value", action_value, shape, "that of reward")
-    _check_shape("next_state_value", next_state_value, shape, "that of reward")
-    _check_shape("done", done, shape, "that of reward")
-    _check_shape("terminated", terminated, shape, "that of reward")
-    _check_shape("log_pi", log_trace, (*shape[:-1], 1), "that of reward with one feature")
-    _check_boolean("done", done)
-    _check_boolean("terminated", terminated)
-    gamma = _coefficient("gamma", gamma, shape)
-    lmbda = _coefficient("lmbda", lmbda, shape)
-
-    # A count or a flag is a reward, too; its targets are no integers.
-    dtype = (reward if reward.is_floating_point() else next_state_value).dtype
-    reward = reward.to(dtype)
-    if dtype in (torch.bfloat16, torch.float16):
-        log_trace, action_value, next_state_value, reward = (
-            tensor.float() for tensor in (log_trace, action_value, next_state_value, reward)
+def _log_trace(trace: str, log_pi: Tensor | None, log_mu: Tensor | None, reward: Tensor) -> Tensor:
+    """Logarithm of a trace coefficient over ``lmbda``, ``[*B, T, 1]``, of checked arguments."""
+    if trace not in _LOG_TRACES:
+        raise ValueError(
+            f"trace must be one of {', '.join(map(repr, _LOG_TRACES))}, got {trace!r}."
         )
-    target = reward + gamma * torch.where(terminated, 0, next_state_value)
-    decay = gamma * lmbda
-    if isinstance(decay, Tensor) and decay.ndim:
-        decay = decay.expand(shape).movedim(time_dim, 0)[:-1]
-    log_trace, action_value, target, done = (
-        tensor.movedim(time_dim, 0) for tensor in (log_trace, action_value, target, done)
-    )
-    # Across a cut ratio and value are another trajectory's: masking them before they are used stops
-    # their gradients too, and a NaN in either.
-    trace = torch.where(done[:-1], -torch.inf, log_trace[1:]).exp() * decay
-    following = torch.where(done[:-1], 0, action_value[1:])
-    head = torch.addcmul(target[:-1], trace, following, value=-1)
-    solution = _solve_recurrence(trace, torch.cat([head, target[-1:]]), vectorized)
-    return solution.movedim(0, time_dim).contiguous().to(dtype)
+    count, log_coefficient = _LOG_TRACES[trace]
+    densities = [torch.zeros_like(reward[..., :1])] * 2
+    for i, (name, given) in enumerate([("log_pi", log_pi), ("log_mu", log_mu)][:count]):
+        if given is None:
+            raise ValueError(f"{name} must be a tensor for trace={trace!r}, got None.")
+        _check_shape(name, given, (*reward.shape[:-1], 1), "that of reward with one feature")
+        densities[i] = given
+    return log_coefficient(*densities)
 
 
 def _solve_recurrence(coefficient: Tensor, delta: Tensor, vectorized: bool) -> Tensor:
@@ -533,8 +412,12 @@ def _solve_recurrence(coefficient: Tensor, delta: Tensor, vectorized: bool) -> T
     of zero are harmless; what they multiply is not read, for it may be NaN. Zeros behind the last
     step spare every round a special case for its end.
 
+    What zeros multiply is masked in every round. Masked once, before the first, a NaN of a
+    trajectory's own would be lost, and a second recurrence that keeps it takes as long: on a CPU
+    1.6 times as fast at 64 x 1,000, a third slower at 5 x 200 and at 160 x 16.
+
     Args:
-        coefficient (Tensor): ``[T - 1, ...]``.
+        coefficient (Tensor): ``[T - 1, ...]``, finite.
         delta (Tensor): ``[T, ...]``.
         vectorized (bool): leave no more than ``_MAX_BLOCKS`` blocks, otherwise one per step.
 

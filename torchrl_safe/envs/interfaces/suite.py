@@ -1,40 +1,48 @@
-"""The dm_control face of the environments: ``load("point", "goal")``, as in its suite."""
+"""The dm_control interface: ``load("point", "goal")``, as in its suite."""
 
 from __future__ import annotations
 
 import copy
 import os
 import sys
+import warnings
 from collections import OrderedDict
 from typing import Any
 
 import mujoco as mujoco_api
 import numpy as np
-from dm_env import specs
 from numpy.typing import NDArray
 
-from torchrl_safe.envs._core import Core, make_core
 from torchrl_safe.envs._random import check_seed
 from torchrl_safe.envs._render import Scene, check_not_forked, has_display
+from torchrl_safe.envs._robot import RobotCore, make_core
 from torchrl_safe.envs.randomization import Randomization
-from torchrl_safe.envs.robots import Array, Robot
+from torchrl_safe.envs.robots import Array, Robot, get_robot
 from torchrl_safe.envs.tasks import Task
 
 # dm_control chooses how to draw when it is imported, and without a display would choose a window.
 if sys.platform == "linux" and not os.environ.get("MUJOCO_GL") and not has_display():
     os.environ["MUJOCO_GL"] = "egl"
 
-from dm_control import mujoco
-from dm_control.mujoco import wrapper
-from dm_control.rl import control
-from dm_control.suite import base
+try:
+    from dm_control import mujoco
+    from dm_control.mujoco import wrapper
+    from dm_control.rl import control
+    from dm_control.suite import base
+    from dm_env import specs
+except ImportError as error:
+    raise ImportError(
+        f"the dm_control interface needs dm-control, and importing it fails: {error}. "
+        "pip install 'dm-control>=1.0.50,<1.1' installs it on Python 3.10 to 3.12; labmaze, which "
+        "it needs, has no wheel for later ones. SafeRobotEnv and gymnasium.make need no dm-control."
+    ) from error
 
 __all__ = ["Physics", "SafeTask", "load"]
 
 
 def load(
     robot: str | Robot = "point",
-    task: str | Task = "goal",
+    task: str | Task | None = None,
     task_kwargs: dict[str, Any] | None = None,
     environment_kwargs: dict[str, Any] | None = None,
     visualize_reward: bool = False,
@@ -45,7 +53,7 @@ def load(
 ) -> control.Environment:
     """An environment of dm_control's reinforcement-learning suite, with a cost.
 
-    Steps are those of :class:`~torchrl_safe.envs.SafeGoalEnv` with one environment and the same
+    Steps are those of :class:`~torchrl_safe.envs.SafeRobotEnv` with one environment and the same
     seed. A time step's ``observation`` holds, besides ``observation`` [D] float32, arrays [1]:
     ``cost`` (float64), ``violation`` and ``goal_met`` (bool), ``violations`` (int64, how many
     violating steps this one counts for). The last time step has discount 1 after a time limit and 0
@@ -53,7 +61,8 @@ def load(
 
     Args:
         robot (str or Robot): the robot, or its name in ``ROBOTS``. Default: ``"point"``.
-        task (str or Task): ``"goal"``, the robot's own task, or one with its options.
+        task (str or Task, optional): the name of a task in ``TASKS``, or a task with its options.
+            Default: the robot's own.
         task_kwargs (dict, optional): the keyword arguments below, in the manner of
             ``dm_control.suite.load``; what is in it counts.
         environment_kwargs (dict, optional): for ``dm_control.rl.control.Environment``:
@@ -76,15 +85,23 @@ def load(
             fit.
 
     Examples:
-        >>> from torchrl_safe.envs import suite
+        >>> from torchrl_safe.envs.interfaces import suite
         >>> env = suite.load("point", "goal", random=0)
         >>> time_step = env.reset()
         >>> time_step = env.step([1.0, 0.0])
         >>> time_step.observation["cost"].shape
         (1,)
     """
-    if isinstance(task, str) and task != "goal":
-        raise ValueError(f"task must be 'goal' or a Task, got {task!r}.")
+    if not isinstance(robot, Robot):
+        robot = get_robot(robot)
+    if task == "goal" != robot.task:
+        warnings.warn(
+            f"load({robot.name!r}, 'goal') makes the robot's own task, {robot.task!r}: say so. "
+            "Later versions will make the goal task.",
+            DeprecationWarning,
+            stacklevel=2,
+        )
+        task = None
     options: dict[str, Any] = {
         "random": random,
         "episode_length": episode_length,
@@ -103,7 +120,7 @@ def load(
     random = options.pop("random")
     core = make_core(
         robot,
-        None if isinstance(task, str) else task,
+        task,
         num_envs=1,
         num_threads=1,
         seed=None,
@@ -120,7 +137,7 @@ def load(
 
 
 class Physics(mujoco.Physics):
-    """The scene as dm_control sees and draws it; the simulator of every face moves it.
+    """The scene as dm_control sees and draws it; the simulator of every interface moves it.
 
     Its model is the robot's with floor, light, goal and hazards, and the cameras ``"overview"`` and
     ``"follow"``. It advances by whole environment steps. What is written to ``data`` (time, qpos,
@@ -128,10 +145,10 @@ class Physics(mujoco.Physics):
     ``data`` shows where the simulator is. A randomised robot is shown as its model.
 
     Args:
-        core (Core): one environment.
+        core (RobotCore): one environment.
     """
 
-    def __init__(self, core: Core) -> None:
+    def __init__(self, core: RobotCore) -> None:
         self._core = core
         self._action = np.zeros(core.action_dim)
         self._scene = Scene(core)
@@ -281,18 +298,19 @@ class Physics(mujoco.Physics):
 
 
 class SafeTask(base.Task):
-    """Rewards, costs and ends of episodes, read off the simulator of every face.
+    """Rewards, costs and ends of episodes, read off the simulator of every interface.
 
     Args:
-        core (Core): one environment.
-        random (int, RandomState, optional): an integer seeds the episodes like every other face's
-            ``seed``; from a ``RandomState``, also one put in later, their seed is drawn.
+        core (RobotCore): one environment.
+        random (int, RandomState, optional): an integer seeds the episodes like every other
+            interface's ``seed``; from a ``RandomState``, also one put in later, their seed is
+            drawn.
 
     Raises:
         ValueError: if the seed is negative.
     """
 
-    def __init__(self, core: Core, random: int | np.random.RandomState | None) -> None:
+    def __init__(self, core: RobotCore, random: int | np.random.RandomState | None) -> None:
         if not isinstance(random, np.random.RandomState):
             check_seed("random", random)
         super().__init__(random)
@@ -324,13 +342,8 @@ class SafeTask(base.Task):
     def get_observation(self, physics: Physics) -> OrderedDict[str, NDArray[Any]]:
         """What the robot observes [D], and what the step cost [1]."""
         frame = self._core.frame
-        return OrderedDict(
-            observation=frame.observation[0].copy(),
-            cost=frame.cost.copy(),
-            violation=frame.violation.copy(),
-            violations=frame.violations.copy(),
-            goal_met=frame.goal_met.copy(),
-        )
+        signals = {name: value.copy() for name, value in self._core.signals(frame).items()}
+        return OrderedDict(observation=frame.observation[0].copy(), **signals)
 
     def get_reward(self, physics: Physics) -> float:
         """Of the last step."""

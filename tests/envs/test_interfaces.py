@@ -1,7 +1,11 @@
-"""The same seed and actions through every face: the same numbers."""
+"""The same seed and actions through every interface: the same numbers."""
 
 from __future__ import annotations
 
+import importlib
+import subprocess
+import sys
+import textwrap
 from collections.abc import Iterator
 
 import gymnasium
@@ -11,14 +15,18 @@ import torch
 from gymnasium.vector import AutoresetMode
 from tensordict import TensorDict
 
+from torchrl_safe import envs
 from torchrl_safe.envs import (
     ROBOTS,
-    GymGoalEnv,
-    GymGoalVectorEnv,
+    GymRobotEnv,
+    GymRobotVectorEnv,
+    GymVelocityEnv,
     Randomization,
-    SafeGoalEnv,
-    suite,
+    SafeRobotEnv,
+    SafeVelocityEnv,
 )
+from torchrl_safe.envs.interfaces import suite
+from torchrl_safe.envs.interfaces.registration import register_envs
 
 LENGTH, STEPS, SEED = 17, 60, 3
 NOISY = Randomization(sensor_noise=(0.01, 0.02), lidar_dropout=(0.1, 0.2), mass=(0.9, 1.1))
@@ -37,7 +45,7 @@ def actions(robot: str, num_envs: int) -> np.ndarray:
 
 def torchrl_steps(robot: str, num_envs: int, **options) -> list[tuple[Step, Step]]:
     """Each step, and what the next one starts from."""
-    env = SafeGoalEnv(
+    env = SafeRobotEnv(
         robot, num_envs=num_envs, num_threads=1, seed=SEED, episode_length=LENGTH, **options
     )
     td = env.reset()
@@ -54,7 +62,7 @@ def arrays(td: TensorDict, keys) -> Step:
 
 
 def gymnasium_steps(robot: str, **options) -> Iterator[tuple[Step, Step]]:
-    env = GymGoalEnv(robot, episode_length=LENGTH, **options)
+    env = GymRobotEnv(robot, episode_length=LENGTH, **options)
     env.reset(seed=SEED)
     for action in actions(robot, 1)[:, 0]:
         observation, reward, terminated, truncated, info = env.step(action)
@@ -66,7 +74,7 @@ def gymnasium_steps(robot: str, **options) -> Iterator[tuple[Step, Step]]:
 
 
 def dm_control_steps(robot: str, **options) -> Iterator[tuple[Step, Step]]:
-    env = suite.load(robot, "goal", random=SEED, episode_length=LENGTH, **options)
+    env = suite.load(robot, random=SEED, episode_length=LENGTH, **options)
     env.reset()
     for action in actions(robot, 1)[:, 0]:
         time_step = env.step(action)
@@ -94,9 +102,9 @@ def assert_same(step: Step, expected: Step, *, rows=slice(None)) -> None:
 def test_single(robot, options):
     expected = torchrl_steps(robot, 1, **options)
     assert sum(bool(step["truncated"] | step["terminated"]) for step, _ in expected) >= 3
-    for face in (gymnasium_steps, dm_control_steps):
+    for interface in (gymnasium_steps, dm_control_steps):
         for (step, then), (expected_step, expected_then) in zip(
-            face(robot, **options), expected, strict=True
+            interface(robot, **options), expected, strict=True
         ):
             # dm_control knows one end of an episode only: a termination hides a time limit.
             if expected_step["terminated"].any():
@@ -117,7 +125,7 @@ class TestVector:
         return robot, request.param
 
     @staticmethod
-    def make(robot, mode, options) -> GymGoalVectorEnv:
+    def make(robot, mode, options) -> GymRobotVectorEnv:
         return gymnasium.make_vec(
             f"torchrl_safe/{robot.title().replace('_', '')}Goal-v0",
             num_envs=4,
@@ -129,27 +137,27 @@ class TestVector:
 
     def test_disabled(self, case):
         robot, options = case
-        envs = self.make(robot, AutoresetMode.DISABLED, options)
-        envs.reset(seed=SEED)
+        vector = self.make(robot, AutoresetMode.DISABLED, options)
+        vector.reset(seed=SEED)
         for action, (expected, then) in zip(
             actions(robot, 4), torchrl_steps(robot, 4, **options), strict=True
         ):
-            observation, reward, terminated, truncated, infos = envs.step(action)
+            observation, reward, terminated, truncated, infos = vector.step(action)
             step = {"observation": observation, "reward": reward, **infos}
             assert_same(step | {"terminated": terminated, "truncated": truncated}, expected)
             over = terminated | truncated
             if over.any():
-                observation, _ = envs.reset(options={"reset_mask": over})
+                observation, _ = vector.reset(options={"reset_mask": over})
             assert_same({"observation": observation}, then)
 
     def test_same_step(self, case):
         robot, options = case
-        envs = self.make(robot, AutoresetMode.SAME_STEP, options)
-        envs.reset(seed=SEED)
+        vector = self.make(robot, AutoresetMode.SAME_STEP, options)
+        vector.reset(seed=SEED)
         for action, (expected, then) in zip(
             actions(robot, 4), torchrl_steps(robot, 4, **options), strict=True
         ):
-            observation, reward, terminated, truncated, infos = envs.step(action)
+            observation, reward, terminated, truncated, infos = vector.step(action)
             assert_same({"observation": observation}, then)
             step = {"reward": reward, "terminated": terminated, "truncated": truncated, **infos}
             over = terminated | truncated
@@ -171,13 +179,13 @@ class TestVector:
         """Each environment's own sequence: its resetting steps take no action of it."""
         robot, options = case
         table, reference = actions(robot, 4), torchrl_steps(robot, 4, **options)
-        envs = self.make(robot, AutoresetMode.NEXT_STEP, options)
-        envs.reset(seed=SEED)
+        vector = self.make(robot, AutoresetMode.NEXT_STEP, options)
+        vector.reset(seed=SEED)
         count, resetting = np.zeros(4, int), np.zeros(4, bool)
         resets = 0
         while count.max() < STEPS:
             action = table[count, np.arange(4)]
-            observation, reward, terminated, truncated, infos = envs.step(action)
+            observation, reward, terminated, truncated, infos = vector.step(action)
             step = {"observation": observation, "reward": reward, **infos}
             step |= {"terminated": terminated, "truncated": truncated}
             for row in range(4):
@@ -194,3 +202,54 @@ class TestVector:
                     count[row] += 1
             resetting = terminated | truncated
         assert resets >= 8
+
+
+class TestOldNames:
+    """Names of version 0.1 still lead somewhere, and say where."""
+
+    @pytest.mark.parametrize(
+        ("module", "name", "new"),
+        [
+            ("goal", "SafeGoalEnv", SafeRobotEnv),
+            ("gymnasium", "GymGoalEnv", GymRobotEnv),
+            ("velocity", "SafeVelocityEnv", SafeVelocityEnv),
+            ("velocity_gymnasium", "GymVelocityEnv", GymVelocityEnv),
+            ("registration", "register_envs", register_envs),
+            ("suite", "load", suite.load),
+        ],
+    )
+    def test_module(self, module, name, new):
+        old = importlib.import_module(f"torchrl_safe.envs.{module}")
+        with pytest.warns(DeprecationWarning, match=f"envs.{module}.{name} is deprecated: use "):
+            assert getattr(old, name) is new
+
+    def test_from_the_package(self):
+        with pytest.warns(DeprecationWarning, match="use torchrl_safe.envs.GymRobotVectorEnv"):
+            assert envs.GymGoalVectorEnv is GymRobotVectorEnv
+        with pytest.warns(DeprecationWarning, match="use torchrl_safe.envs.interfaces.suite"):
+            from torchrl_safe.envs import suite as old
+        assert old is suite
+
+    def test_safe_goal_env_is_the_same_class(self):
+        assert envs.SafeGoalEnv is SafeRobotEnv
+
+
+def test_without_dm_control():
+    """Who has no dm_control learns how to get it; nobody else needs it."""
+    code = """
+        import sys
+
+        sys.modules["dm_control"] = None
+        import gymnasium
+        from torchrl_safe.envs import SafeRobotEnv
+
+        SafeRobotEnv("point", num_envs=1).rollout(2)
+        gymnasium.make("torchrl_safe/SafetyHopperVelocity-v1").reset()
+        try:
+            from torchrl_safe.envs.interfaces import suite
+        except ImportError as error:
+            print(error)
+    """
+    command = [sys.executable, "-W", "ignore", "-c", textwrap.dedent(code)]
+    said = subprocess.run(command, check=True, capture_output=True, text=True).stdout
+    assert said.startswith("the dm_control interface needs dm-control")

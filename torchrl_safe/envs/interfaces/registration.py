@@ -23,21 +23,21 @@ def register_envs() -> None:
     for name in ROBOTS:
         gymnasium.register(
             f"torchrl_safe/{name.title().replace('_', '')}Goal-v0",
-            entry_point="torchrl_safe.envs.gymnasium:GymGoalEnv",
-            vector_entry_point="torchrl_safe.envs.gymnasium:GymGoalVectorEnv",
+            entry_point="torchrl_safe.envs.interfaces.gymnasium:GymRobotEnv",
+            vector_entry_point="torchrl_safe.envs.interfaces.gymnasium:GymRobotVectorEnv",
             kwargs={"robot": name},
         )
     for velocity in VELOCITY_TASKS.values():
         gymnasium.register(
             f"torchrl_safe/Safety{velocity.title}Velocity-v1",
-            entry_point="torchrl_safe.envs.velocity_gymnasium:GymVelocityEnv",
-            vector_entry_point="torchrl_safe.envs.velocity_gymnasium:GymVelocityVectorEnv",
+            entry_point="torchrl_safe.envs.interfaces.gymnasium:GymVelocityEnv",
+            vector_entry_point="torchrl_safe.envs.interfaces.gymnasium:GymVelocityVectorEnv",
             kwargs={"task": velocity.name},
         )
     for name, (robot, task) in SAFETY_TASKS.items():
         gymnasium.register(
             f"torchrl_safe/{name}-v0",
-            entry_point="torchrl_safe.envs.gymnasium:GymGoalEnv",
-            vector_entry_point="torchrl_safe.envs.gymnasium:GymGoalVectorEnv",
+            entry_point="torchrl_safe.envs.interfaces.gymnasium:GymRobotEnv",
+            vector_entry_point="torchrl_safe.envs.interfaces.gymnasium:GymRobotVectorEnv",
             kwargs={"robot": robot, "task": task, "episode_length": task.episode_length},
         )

@@ -1,6 +1,6 @@
-"""Frames per second of every face, and their share of the physics alone: a Markdown table a robot.
+"""Frames per second of every interface, beside the physics alone: a Markdown table a robot.
 
-    python benchmarks/bench_faces.py              # all robots: at most four minutes; or name some
+    python benchmarks/bench_interfaces.py         # all robots: at most four minutes; or name some
 
 A frame is a step of one environment. The floor is the physics of the same compiled model on
 MuJoCo's thread pool, with as many threads, and nothing else but the robot's map from actions to
@@ -29,7 +29,7 @@ from torchrl_safe.envs import (
     ROBOTS,
     CostToReward,
     Robot,
-    SafeGoalEnv,
+    SafeRobotEnv,
     cost_from_info,
     get_robot,
     suite,
@@ -163,7 +163,7 @@ def wrapped_dm_control(robot: Robot, num_envs: int, num_threads: int) -> EnvBase
 ROWS: dict[str, tuple[Callable[..., Stepper], list[int]]] = {
     "`mj_step` in a loop, 1 thread": (mj_step, NUM_ENVS),
     FLOOR: (batch, NUM_ENVS),
-    "`SafeGoalEnv`": (partial(torchrl, partial(SafeGoalEnv, stagger=True)), NUM_ENVS),
+    "`SafeRobotEnv`": (partial(torchrl, partial(SafeRobotEnv, stagger=True)), NUM_ENVS),
     "`gymnasium.make_vec`": (vector, NUM_ENVS),
     "the same in TorchRL's `GymWrapper`": (partial(torchrl, wrapped_gymnasium), NUM_ENVS),
     '`make_vec(..., vectorization_mode="sync")`, 1 thread': (vector_of_singles, [16]),
@@ -225,7 +225,7 @@ def main() -> None:
             if num_envs in sizes
         }
         print(table(name, measure(steppers, clock, options.rounds, options.seconds)))
-        env = SafeGoalEnv(robot, num_envs=64, num_threads=options.num_threads)
+        env = SafeRobotEnv(robot, num_envs=64, num_threads=options.num_threads)
         resets: dict[Cell, Stepper] = {("reset", 64): env.reset}
         (rates,) = measure(resets, clock, options.rounds, options.seconds).values()
         print(f"\nA reset of 64: {1e3 * 64 / statistics.median(rates):.1f} ms\n", flush=True)

@@ -1,0 +1,50 @@
+"""What holds for every test: one thread of torch, and a checkout that is left as it was."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+LEFT_BEHIND = pytest.StashKey[set[str]]()
+
+# Workers share the cores, and sums have the same last bits on every machine. Read when torch loads.
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+
+def untracked() -> set[str]:
+    """What git neither tracks nor ignores in the checkout, empty folders included."""
+    listing = subprocess.run(
+        ["git", "clean", "--dry-run", "-d"], cwd=ROOT, capture_output=True, text=True, check=False
+    )
+    return set(listing.stdout.splitlines())  # none without git, as in a source distribution
+
+
+def is_worker(config: pytest.Config) -> bool:
+    return hasattr(config, "workerinput")  # one of pytest-xdist's, of whom several run at a time
+
+
+def pytest_sessionstart(session: pytest.Session) -> None:
+    if not is_worker(session.config):
+        session.config.stash[LEFT_BEHIND] = untracked()
+
+
+@pytest.hookimpl(trylast=True)
+def pytest_sessionfinish(session: pytest.Session) -> None:
+    """Tests write to `tmp_path`: what they leave here changes what lint and imports see."""
+    if is_worker(session.config):
+        return
+    left = session.config.stash[LEFT_BEHIND] = untracked() - session.config.stash[LEFT_BEHIND]
+    if left and session.exitstatus in (pytest.ExitCode.OK, pytest.ExitCode.NO_TESTS_COLLECTED):
+        session.exitstatus = pytest.ExitCode.TESTS_FAILED
+
+
+def pytest_terminal_summary(
+    terminalreporter: pytest.TerminalReporter, config: pytest.Config
+) -> None:
+    if left := config.stash[LEFT_BEHIND]:
+        terminalreporter.section("tests left files in the checkout", red=True, bold=True)
+        terminalreporter.write_line("\n".join(sorted(left)))

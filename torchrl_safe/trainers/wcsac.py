@@ -118,15 +118,12 @@ class WCSAC(ConstrainedTrainer):
     ) -> dict[str, torch.Tensor]:
         """Of the policy, up the Lagrangian, and of the entropy weight."""
         action, log_prob = self.policy.get_dist(minibatch).rsample_and_log_prob()
+        objective = self.reward_loss.objective(minibatch, action, log_prob).mean()
         constraints = [  # of one action, as the objective is
             self.cost_losses[cost].cvar(minibatch, action).mean() - limit
             for cost, limit in limits.items()
         ]
-        value = lagrangian(
-            self.reward_loss.objective(minibatch, action, log_prob).mean(),
-            torch.stack(constraints),
-            self.multiplier(),
-        )
+        value = lagrangian(objective, torch.stack(constraints), self.multiplier())
         entropy = -q_logarithm(log_prob.detach(), self.options.loss.entropic_index)
         return {
             "loss_actor": -value,

@@ -22,9 +22,9 @@ from torchrl_safe.envs.randomization import (
     Randomization,
 )
 from torchrl_safe.envs.robots import ROBOTS, Robot, get_robot
-from torchrl_safe.envs.tasks import GoalTask, NavigationTask
+from torchrl_safe.envs.tasks import GoalTask, NavigationSpeedTask, NavigationTask
 from torchrl_safe.envs.tasks.velocity import VELOCITY_TASKS, VelocityTask, get_velocity_task
-from torchrl_safe.envs.transforms import SafeFrameSkip
+from torchrl_safe.envs.transforms import CostFunction, SafeFrameSkip, cost_names
 
 if TYPE_CHECKING:
     from torchrl_safe.envs.interfaces.gymnasium import (
@@ -42,12 +42,14 @@ __all__ = [
     "RANDOMIZATIONS",
     "ROBOTS",
     "VELOCITY_TASKS",
+    "CostFunction",
     "CostToReward",
     "GoalTask",
     "GymRobotEnv",
     "GymRobotVectorEnv",
     "GymVelocityEnv",
     "GymVelocityVectorEnv",
+    "NavigationSpeedTask",
     "NavigationTask",
     "Randomization",
     "Robot",
@@ -58,6 +60,7 @@ __all__ = [
     "VelocityTask",
     "check_safe_env",
     "cost_from_info",
+    "cost_names",
     "get_robot",
     "get_velocity_task",
 ]

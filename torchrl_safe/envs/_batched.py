@@ -13,6 +13,7 @@ from tensordict import TensorDict, TensorDictBase
 from torchrl.data import Binary, Bounded, Composite, TensorSpec, Unbounded
 from torchrl.envs import EnvBase
 
+from torchrl_safe._costs import cost_key
 from torchrl_safe.envs._core import Core
 
 
@@ -43,7 +44,7 @@ class BatchedEnv(EnvBase):
             return Composite(**entries, shape=(num_envs,), device=device)
 
         several = core.cost_names
-        costs = [f"{name}_cost" for name in several] if several else ["cost"]
+        costs = [cost_key(name) for name in several or ("",)]
         highest = np.broadcast_to(core.max_cost, len(costs)).tolist()
         self._costs = frozenset(costs)
         shown = {k: v for k, v in core.signals(core.frame).items() if k not in self._costs}

@@ -17,8 +17,10 @@ from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torchrl.data import Binary, Composite, TensorSpec, Unbounded
 from torchrl.envs import Compose, EnvBase, FrameSkipTransform, Transform, TransformedEnv
-from torchrl.envs.gym_like import BaseInfoDictReader
+from torchrl.envs.gym_like import BaseInfoDictReader, GymLikeEnv
 from torchrl.envs.libs.gym import GymWrapper
+
+from torchrl_safe._costs import cost_key, violation_key
 
 __all__ = ["CostToReward", "cost_from_info"]
 
@@ -95,7 +97,7 @@ class CostToReward(Transform):
     def transform_output_spec(self, output_spec: Composite) -> Composite:
         """Moves the leaf."""
         if self.parent is not None:
-            _reject_skipped_frames(self.parent)
+            reject_skipped_frames(self.parent)
         output_spec = output_spec.clone()
         observations, batch_size = output_spec["full_observation_spec"], output_spec.shape
         keys = list(observations.keys(True, True))
@@ -185,7 +187,7 @@ def cost_from_info(
             "env must not have transforms yet: append them to what this returns. Several costs go "
             "in at once, cost={name: ...}."
         )
-    _reject_skipped_frames(env)
+    reject_skipped_frames(env)
     several = isinstance(cost, Mapping)
     sources = dict(cost) if isinstance(cost, Mapping) else {"": cost}
     if not sources or not all(isinstance(name, str) for name in sources):
@@ -200,37 +202,30 @@ def cost_from_info(
     if bounds.keys() != sources.keys():
         names = sorted(sources) if several else "one number"
         raise ValueError(f"violation_above must be for {names}, got {sorted(bounds)}.")
-    prefixes = {name: f"{name}_" if several else "" for name in sources}
     taken = {*env.full_observation_spec.keys(), *env.full_reward_spec.keys()}
-    clashes = sorted(
-        taken & {prefix + key for prefix in prefixes.values() for key in ("cost", "violation")}
-    )
+    clashes = sorted(taken & {key(name) for name in sources for key in (cost_key, violation_key)})
     if clashes:
         raise ValueError(
             f"the environment has entries {clashes} of its own: name the costs otherwise, "
             "cost={name: ...}."
         )
     env.set_info_dict_reader(
-        _CostReader(
-            {f"{prefixes[name]}cost": source for name, source in sources.items()}, env.batch_size
-        )
+        _CostReader({cost_key(name): source for name, source in sources.items()}, env.batch_size)
     )
     return TransformedEnv(
         env,
         Compose(
             *(
                 CostToReward(
-                    f"{prefix}cost",
-                    violation_key=f"{prefix}violation",
-                    violation_above=bounds[name],
+                    cost_key(name), violation_key=violation_key(name), violation_above=bounds[name]
                 )
-                for name, prefix in prefixes.items()
+                for name in sources
             )
         ),
     )
 
 
-def _reject_skipped_frames(env: EnvBase) -> None:
+def reject_skipped_frames(env: EnvBase) -> None:
     """The cost of a step is then that of its last frame, while rewards are added up."""
     skip = 1
     while isinstance(env, TransformedEnv):
@@ -238,7 +233,8 @@ def _reject_skipped_frames(env: EnvBase) -> None:
             if isinstance(transform, FrameSkipTransform):
                 skip = max(skip, transform.frame_skip)
         env = env.base_env
-    skip = max(skip, getattr(env, "wrapper_frame_skip", 1))
+    if isinstance(env, GymLikeEnv):
+        skip = max(skip, env.wrapper_frame_skip)
     if skip > 1:
         raise ValueError(
             f"frame_skip={skip} loses the costs of the frames between: append "

@@ -15,6 +15,9 @@ from torchrl.data import Composite
 from torchrl.envs import EnvBase, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
+from torchrl_safe import _costs as naming
+from torchrl_safe.envs.transforms import cost_names
+
 __all__ = ["check_safe_env"]
 
 _DONE_KEYS = ("done", "terminated", "truncated")
@@ -27,7 +30,7 @@ def check_safe_env(
     time_limit: int | None = None,
     num_steps: int = 20,
     seed: int = 0,
-    cost_key: NestedKey = "cost",
+    cost_key: NestedKey | None = None,
     violation_key: NestedKey | None = "violation",
 ) -> None:
     """Runs an environment through everything that the blocks of this package rely on.
@@ -35,9 +38,9 @@ def check_safe_env(
     In this order; the first broken promise raises:
 
     1. ``check_env_specs`` of TorchRL succeeds;
-    2. the cost is a leaf of the reward spec beside a reward, ``[*B, 1]``, float32; it is finite, as
-       reward and observation are, and never negative;
-    3. the violation is an observation, ``[*B, 1]``, bool;
+    2. the cost, and each of several, is a leaf of the reward spec beside a reward, ``[*B, 1]``,
+       float32; it is finite, as reward and observation are, and never negative;
+    3. its violation is an observation, ``[*B, 1]``, bool;
     4. ``done`` is ``terminated | truncated``, and a time limit truncates without terminating;
     5. the same seed and actions give the same rollout, whatever happened before;
     6. what a step returned is not written to by later steps;
@@ -60,7 +63,8 @@ def check_safe_env(
             limit. Make it small: the check steps this far.
         num_steps (int): steps of each rollout. Default: 20.
         seed (int): the first seed used. Default: 0.
-        cost_key (NestedKey): Default: ``"cost"``.
+        cost_key (NestedKey, optional): the only one that is looked at. Default: ``"cost"``; each
+            ``"<name>_cost"`` where there are several, with its ``"<name>_violation"``.
         violation_key (NestedKey, optional): ``None`` for environments without. Default:
             ``"violation"``.
 
@@ -79,7 +83,15 @@ def check_safe_env(
     with _quiet(), torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         check_env_specs(env, seed=seed)
-        _check_promises(env, twins, time_limit, num_steps, seed, cost_key, violation_key)
+        names = cost_names(env) if cost_key is None else ()
+        if names:
+            flags = names if violation_key is not None else ()
+            costs = [naming.cost_key(name) for name in names]
+            violations: list[NestedKey] = [naming.violation_key(name) for name in flags]
+        else:
+            costs = ["cost" if cost_key is None else cost_key]
+            violations = [] if violation_key is None else [violation_key]
+        _check_promises(env, twins, time_limit, num_steps, seed, costs, violations)
 
 
 def _check_promises(
@@ -88,19 +100,23 @@ def _check_promises(
     time_limit: int | None,
     num_steps: int,
     seed: int,
-    cost_key: NestedKey,
-    violation_key: NestedKey | None,
+    costs: list[NestedKey],
+    violations: list[NestedKey],
 ) -> None:
     shape = torch.Size((*env.batch_size, 1))
-    _check_leaf(env.full_reward_spec, cost_key, shape, torch.float32)
-    _promise(len(env.reward_keys) > 1, f"there must be a reward beside {cost_key!r}.")
-    if violation_key is not None:
-        _check_leaf(env.full_observation_spec, violation_key, shape, torch.bool)
+    for cost in costs:
+        _check_leaf(env.full_reward_spec, cost, shape, torch.float32)
+    _promise(
+        len(env.reward_keys) > len(costs),
+        f"there must be a reward beside {', '.join(map(repr, costs))}.",
+    )
+    for violation in violations:
+        _check_leaf(env.full_observation_spec, violation, shape, torch.bool)
 
     actions = [env.full_action_spec.rand() for _ in range(max(num_steps, time_limit or 0))]
     kept: list[TensorDictBase] = []
     rollout = _rollout(env, actions, seed, kept)
-    _check_values(env, rollout, cost_key)
+    _check_values(env, rollout, costs)
     _check_done(rollout)
     if time_limit is not None:
         _check_time_limit(rollout, time_limit)
@@ -136,7 +152,7 @@ def _check_leaf(spec: Composite, key: NestedKey, shape: torch.Size, dtype: torch
     )
 
 
-def _check_values(env: EnvBase, rollout: TensorDictBase, cost_key: NestedKey) -> None:
+def _check_values(env: EnvBase, rollout: TensorDictBase, costs: list[NestedKey]) -> None:
     observations = list(env.full_observation_spec.keys(True, True))
     for steps, keys in ((rollout, observations), (rollout["next"], observations + env.reward_keys)):
         for key in keys:
@@ -144,8 +160,9 @@ def _check_values(env: EnvBase, rollout: TensorDictBase, cost_key: NestedKey) ->
             if value.is_floating_point():
                 wrong = ~value.isfinite()
                 _promise(not wrong.any(), f"{key!r} must be finite, it is not at {_where(wrong)}.")
-    negative = rollout["next"].get(cost_key) < 0
-    _promise(not negative.any(), f"{cost_key!r} must not be negative, it is at {_where(negative)}.")
+    for cost in costs:
+        negative = rollout["next"].get(cost) < 0
+        _promise(not negative.any(), f"{cost!r} must not be negative, it is at {_where(negative)}.")
 
 
 def _check_done(rollout: TensorDictBase) -> None:

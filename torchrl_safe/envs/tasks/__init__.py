@@ -4,6 +4,7 @@ from torchrl_safe.envs.robots import Robot, get_robot
 from torchrl_safe.envs.tasks.base import Objects, Outcome, Prop, Sensed, Task
 from torchrl_safe.envs.tasks.goal import GoalTask
 from torchrl_safe.envs.tasks.navigation import NavigationTask
+from torchrl_safe.envs.tasks.navigation_speed import NavigationSpeedTask
 from torchrl_safe.envs.tasks.safety import SafetyTask
 from torchrl_safe.envs.tasks.safety_button import SafetyButtonTask
 from torchrl_safe.envs.tasks.safety_circle import SafetyCircleTask
@@ -15,6 +16,7 @@ __all__ = [
     "SAFETY_TASKS",
     "TASKS",
     "GoalTask",
+    "NavigationSpeedTask",
     "NavigationTask",
     "Objects",
     "Outcome",
@@ -30,7 +32,11 @@ __all__ = [
     "get_task",
 ]
 
-TASKS: dict[str, type[Task]] = {"goal": GoalTask, "navigation": NavigationTask}
+TASKS: dict[str, type[Task]] = {
+    "goal": GoalTask,
+    "navigation": NavigationTask,
+    "navigation_speed": NavigationSpeedTask,
+}
 
 _FAMILIES: dict[str, type[SafetyTask]] = {
     "Goal": SafetyGoalTask,

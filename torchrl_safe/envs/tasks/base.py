@@ -27,8 +27,8 @@ class Sensed(NamedTuple):
 
     Attributes:
         scan (array): [N, R], readings of the lidar: 0 sees nothing, 1 is at the robot.
-        cost (array): [N], of being here.
-        violation (array): [N] bool, whether being here breaks the constraint.
+        cost (array): [N], of being here; [N, m] in a task with m costs.
+        violation (array): [N] or [N, m] bool, whether being here breaks the constraint.
         contact (array): [N] bool, whether the robot touches something it must not.
     """
 
@@ -44,8 +44,8 @@ class Outcome(NamedTuple):
     Attributes:
         objects (dict of arrays): the objects after the step; those before it are left alone.
         reward (array): [N].
-        cost (array): [N].
-        violations (array): [N] int64, how many violating steps the step counts for.
+        cost (array): [N]; [N, m] in a task with m costs.
+        violations (array): [N] or [N, m] int64, how many violating steps the step counts for.
         goal_met (array): [N] bool.
         terminated (array): [N] bool.
     """
@@ -81,12 +81,13 @@ class Task(Protocol):
     """A task: the options of an environment and what follows from them, over a batch.
 
     Methods take arrays and leave them alone; the core holds all state. A row of a result depends
-    on the same row of the arguments only.
+    on the same row of the arguments only. A task with several costs names them in ``cost_names``,
+    a tuple of strings.
     """
 
     @property
-    def max_cost(self) -> float:
-        """The largest cost of a step."""
+    def max_cost(self) -> float | tuple[float, ...]:
+        """The largest cost of a step; of each in a task with several."""
 
     @property
     def extent(self) -> float:

@@ -93,7 +93,7 @@ class NavigationTask:
             )
 
     @property
-    def max_cost(self) -> float:
+    def max_cost(self) -> float | tuple[float, ...]:
         """The largest cost of a step: a contact with endless steps remaining."""
         return 1.0 / (1.0 - self.discount)
 

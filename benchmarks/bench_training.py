@@ -10,11 +10,10 @@ import sys
 import tempfile
 from pathlib import Path
 
-import hydra
 import numpy as np
-from omegaconf import DictConfig
 
 from torchrl_safe.record import read_metrics
+from torchrl_safe.trainers import SafeTAC, cli
 
 EXAMPLE = Path(__file__).resolve().parents[1] / "examples" / "safetac_point.py"
 NUM_UPDATES = 8
@@ -31,22 +30,21 @@ SILENT = [
 OMNISAFE_CPO = 129
 
 
-def compose(overrides: list[str]) -> DictConfig:
-    """The example's configuration."""
-    with hydra.initialize_config_dir(str(EXAMPLE.parent), version_base="1.3"):
-        return hydra.compose(EXAMPLE.stem, overrides)
+def compose(overrides: list[str]) -> SafeTAC.Options:
+    """The example's options."""
+    return cli.compose("safetac", overrides)
 
 
-def warm_up_updates(cfg: DictConfig) -> int:
+def warm_up_updates(options: SafeTAC.Options) -> int:
     """Updates up to the first one that learns, which warms up."""
-    return max(1, -(-cfg.collector.init_frames // cfg.collector.frames_per_batch))
+    return max(1, -(-options.collector.init_frames // options.collector.frames_per_batch))
 
 
 def main(overrides: list[str]) -> None:
     """Train for a few updates and print the table."""
-    cfg = compose(overrides)
-    per_batch = cfg.collector.frames_per_batch
-    updates = warm_up_updates(cfg) + NUM_UPDATES
+    options = compose(overrides)
+    per_batch = options.collector.frames_per_batch
+    updates = warm_up_updates(options) + NUM_UPDATES
     with tempfile.TemporaryDirectory() as run_dir:
         training = [*SILENT, f"collector.total_frames={updates * per_batch}", f"run_dir={run_dir}"]
         command = [sys.executable, EXAMPLE, *overrides, *training]

@@ -9,12 +9,12 @@ from typing import Any
 import pytest
 import torch
 from bench_training import compose
-from safetac_point import policy_closure
 from tensordict import TensorDict
 from torch import Tensor
 
 from torchrl_safe import GMMTanhPolicy, TrustRegionSafeOptimizer
 from torchrl_safe.envs import SafeGoalEnv
+from torchrl_safe.modules import DISTANCES
 from torchrl_safe.optim.curvature import (
     Product,
     conjugate_gradient,
@@ -24,11 +24,10 @@ from torchrl_safe.optim.curvature import (
     hessian_product,
 )
 from torchrl_safe.optim.repetition import CudaGraphRepeat, Repeat, one_by_one
-from torchrl_safe.trainers.critics import make_losses
-from torchrl_safe.trainers.policy_steps import moment_kl, moments
-from torchrl_safe.trainers.utils import make_policy
+from torchrl_safe.trainers import SafeTAC
 
 NUM_STATES = 5000
+MOMENTS = DISTANCES["moment_matched"]
 CG_ITERS = 10
 
 
@@ -36,22 +35,23 @@ def make_closures(
     width: int,
     device: str,
 ) -> tuple[Any, GMMTanhPolicy, TensorDict, Callable[..., Callable[[], TensorDict]]]:
-    """Configuration, policy, states, and a maker of closures with an active constraint."""
+    """Options, policy, states, and a maker of closures with an active constraint."""
     torch.manual_seed(0)
     widths = [f"policy.num_cells=[{width},{width}]", f"critic.num_cells=[{width},{width}]"]
-    cfg = compose([*widths, "policy.num_components=5", f"device={device}"])
+    options = compose([*widths, "policy.num_components=5", f"device={device}"])
     env = SafeGoalEnv(num_envs=1, num_threads=1, device=device)
-    policy = make_policy(cfg, env)
-    losses = make_losses(cfg, env, policy)
+    trainer = SafeTAC(options=options)
+    trainer.build(env)
+    policy = trainer.policy
     states = TensorDict({"observation": torch.randn(NUM_STATES, 24)}, [NUM_STATES]).to(device)
     batch = env.rollout(20, policy)
-    losses[1].cost_limit = losses[1].on_policy_cvar(batch)
+    limits = {name: loss.on_policy_cvar(batch) for name, loss in trainer.cost_losses.items()}
 
     def closure_of(curvature_frames: int | None = None) -> Callable[[], TensorDict]:
         torch.manual_seed(0)
-        return policy_closure(policy, *losses, states, batch, curvature_frames)
+        return trainer.policy_closure(states, limits, batch, curvature_frames)
 
-    return cfg, policy, states, closure_of
+    return options, policy, states, closure_of
 
 
 def in_terms_of_kl(closure: Callable[[], TensorDict]) -> Callable[[], TensorDict]:
@@ -61,7 +61,7 @@ def in_terms_of_kl(closure: Callable[[], TensorDict]) -> Callable[[], TensorDict
 
     def kl_closure() -> TensorDict:
         out = closure()
-        out["kl"] = moment_kl(old, out.pop("statistics"))
+        out["kl"] = MOMENTS.kl(old, out.pop("statistics"))
         return out
 
     return kl_closure
@@ -74,9 +74,9 @@ def rebuilt_hessian_product(policy: GMMTanhPolicy, states: TensorDict) -> Produc
     def product(vectors: Tensor) -> Tensor:
         rows = []
         for vector in vectors:
-            new = TensorDict(moments(policy.get_dist(states)))
+            new = TensorDict(MOMENTS.statistics(policy.get_dist(states)))
             slope = flatten(
-                gradient("kl", [moment_kl(new.detach(), new)], params, create_graph=True)
+                gradient("kl", [MOMENTS.kl(new.detach(), new)], params, create_graph=True)
             )
             rows.append(flatten(gradient("slope", [slope @ vector], params)))
         return torch.stack(rows)
@@ -86,7 +86,7 @@ def rebuilt_hessian_product(policy: GMMTanhPolicy, states: TensorDict) -> Produc
 
 def make_solver(width: int, device: str, curvature: str) -> Callable[[], Tensor]:
     """Conjugate gradients for g and b, from the closure's outputs to both solutions."""
-    cfg, policy, states, closure_of = make_closures(width, device)
+    options, policy, states, closure_of = make_closures(width, device)
     params = list(policy.parameters())
     repeat: Repeat = one_by_one
     stream: Callable[[], AbstractContextManager[None]] = nullcontext
@@ -101,15 +101,15 @@ def make_solver(width: int, device: str, curvature: str) -> Callable[[], Tensor]
 
     def make_product() -> Product:
         if curvature == "gauss_newton_quarter":
-            return gauss_newton_product(out["curvature_statistics"], moment_kl, params)
+            return gauss_newton_product(out["curvature_statistics"], MOMENTS.kl, params)
         if curvature.startswith("gauss_newton"):
-            return gauss_newton_product(out["statistics"], moment_kl, params)
+            return gauss_newton_product(out["statistics"], MOMENTS.kl, params)
         if curvature == "double_backward":
-            return hessian_product(moment_kl(old, out["statistics"]), params)
+            return hessian_product(MOMENTS.kl(old, out["statistics"]), params)
         return rebuilt_hessian_product(policy, states)
 
     def solve() -> Tensor:
-        damping = cfg.optim.damping
+        damping = options.optim.damping
         with stream():
             product = make_product()
             return conjugate_gradient(
@@ -164,13 +164,13 @@ def bench_natural_gradients(
 def bench_step(benchmark: Any, device: str, timed: Any, width: int, curvature: str) -> None:
     """One step from the same weights on the same states, line search included."""
     benchmark.group = f"trust-region step, 24-{width}-{width}, 5 Gaussians, {NUM_STATES} states"
-    cfg, policy, _, closure_of = make_closures(width, device)
+    options, policy, _, closure_of = make_closures(width, device)
     optim = TrustRegionSafeOptimizer(
         policy.parameters(),
-        max_kl=cfg.optim.max_kl,
-        damping=cfg.optim.damping,
+        max_kl=options.optim.max_kl,
+        damping=options.optim.damping,
         cg_iters=CG_ITERS,
-        statistics_kl=None if curvature == "double_backward" else moment_kl,
+        statistics_kl=None if curvature == "double_backward" else MOMENTS.kl,
         cuda_graph=curvature.endswith("cuda_graph"),
     )
     weights = [p.detach().clone() for p in policy.parameters()]

@@ -1,7 +1,7 @@
 """How fast ``doggo`` walks in every direction, and how many robots tip over.
 
-``python benchmarks/doggo_walk.py``; ``--weights`` measures what a run of
-``examples/doggo_controller.py`` exported: ``legs.safetensors``, or ``gait.safetensors`` before PPO.
+``python benchmarks/doggo_walk.py``; ``--weights`` measures what a run of doggo_controller.py
+exported: ``legs.safetensors``, or ``gait.safetensors`` before PPO.
 """
 
 from __future__ import annotations

@@ -27,12 +27,10 @@ from collections.abc import Iterable, Iterator
 from contextlib import redirect_stdout
 from pathlib import Path
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "examples"))
-
-import safetac_point
 from bench_training import SILENT, compose, warm_up_updates
 
-from torchrl_safe.trainers import utils
+from torchrl_safe.trainers import SafeTAC
+from torchrl_safe.trainers.run import Run
 
 NUM_UPDATES = 16  # after the warm-up
 RATE = 25  # looks per second: each stops the example for milliseconds
@@ -40,10 +38,10 @@ RATE = 25  # looks per second: each stops the example for milliseconds
 PARTS = {
     "collect: policy, environment, tensordicts": ["Collector.rollout"],
     "replay: store and sample slices": ["ReplayBuffer.extend", "ReplayBuffer.sample"],
-    "targets: networks and Retrace": ["with_targets"],
+    "targets: networks and Retrace": ["CriticFit.__init__.<locals>.add_targets"],
     "critics: gradient steps": ["CriticFit.__init__.<locals>.descend"],
-    "policy: trust-region step": ["main.<locals>.update"],
-    "logging and what is left": ["train"],
+    "policy: trust-region step": ["SafeTAC._step", "SafeTAC._ascend"],
+    "logging and what is left": ["Trainer._loop"],
 }
 PART_OF = {function: part for part, functions in PARTS.items() for function in functions}
 # Whose work it is, by the file it is in. One that is nobody's, such as the C library, works for
@@ -64,16 +62,16 @@ def record(overrides: list[str]) -> list[str]:
     Returns:
         list: a line per stack, outermost frame first, with the number of times it was seen.
     """
-    cfg = compose(["num_threads=1", *overrides, *SILENT])
-    first = warm_up_updates(cfg)
+    options = compose(["num_threads=1", *overrides, *SILENT])
+    first = warm_up_updates(options)
     last = first + NUM_UPDATES
-    cfg.collector.total_frames = last * cfg.collector.frames_per_batch
+    options.collector.total_frames = last * options.collector.frames_per_batch
     # Where a process may look at its children alone, it has to be allowed to look at its parent.
     ctypes.CDLL(None).prctl(PR_SET_PTRACER, PR_SET_PTRACER_ANY, 0, 0, 0)
-    log, updates = utils.Run.log, 0
+    log, updates = Run.log, 0
     sampler: subprocess.Popen[str]
 
-    def log_and_watch(run: utils.Run, metrics: dict[str, float]) -> None:
+    def log_and_watch(run: Run, metrics: dict[str, float]) -> None:
         nonlocal sampler, updates
         log(run, metrics)  # the last thing an update does
         updates += 1
@@ -83,11 +81,11 @@ def record(overrides: list[str]) -> list[str]:
             sampler.send_signal(signal.SIGINT)
             sampler.communicate()
 
-    utils.Run.log = log_and_watch
+    Run.log = log_and_watch
     with tempfile.TemporaryDirectory() as run_dir:
-        cfg.run_dir, stacks = run_dir, Path(run_dir, "stacks")
+        options.run_dir, stacks = run_dir, Path(run_dir, "stacks")
         with redirect_stdout(sys.stderr):
-            safetac_point.main.__wrapped__(cfg)
+            SafeTAC(options=options).train()
         return stacks.read_text().splitlines()
 
 

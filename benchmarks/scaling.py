@@ -21,19 +21,15 @@ from contextlib import redirect_stdout
 from functools import partial
 from pathlib import Path
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "examples"))
-
 import numpy as np
-import safetac_point
 from bench_training import SILENT, compose, warm_up_updates
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
-from omegaconf import DictConfig
 
 from torchrl_safe.record import read_metrics
+from torchrl_safe.trainers import SafeTAC
 from torchrl_safe.trainers.collectors import make_collector
-from torchrl_safe.trainers.critics import REPLAYED, make_buffer
-from torchrl_safe.trainers.utils import make_env, make_policy
+from torchrl_safe.trainers.off_policy import make_slice_buffer, replayed
 
 ROOT = Path(__file__).resolve().parents[1]
 TABLE = ROOT / "benchmarks" / "results" / "scaling.csv"
@@ -41,6 +37,7 @@ PICTURE = ROOT / "docs" / "images" / "scaling.png"
 BASE = [
     *("num_threads=1", "optim.critic_rounds=2"),
     "replay_buffer.size=100_000",  # a run ends with a checkpoint of it
+    "collector.init_frames=64_000",  # 1600 environments have slices to draw from by then
 ]
 NUM_UPDATES = 3  # measured, after one that warms up
 PARTS = ("collect and other", "targets", "critics", "policy")
@@ -68,20 +65,20 @@ def overrides(axis: str, value: int) -> list[str]:
     return [f"policy.{cells}", f"critic.{cells}"]
 
 
-def configuration(options: list[str], run_dir: str) -> DictConfig:
-    return compose([*BASE, *options, *SILENT, f"run_dir={run_dir}"])
+def make_trainer(words: list[str], run_dir: str) -> SafeTAC:
+    return SafeTAC(options=compose([*BASE, *words, *SILENT, f"run_dir={run_dir}"]))
 
 
-def training_cost(options: list[str]) -> dict[str, float]:
+def training_cost(words: list[str]) -> dict[str, float]:
     """Microseconds per frame of each part of an update, medians."""
     with tempfile.TemporaryDirectory() as run_dir:
-        cfg = configuration(options, run_dir)
-        per_batch = cfg.collector.frames_per_batch
-        # Every environment has slices to draw from when learning begins.
-        cfg.collector.init_frames = 2 * cfg.replay_buffer.slice_len * cfg.env.num_envs
-        cfg.collector.total_frames = (warm_up_updates(cfg) + NUM_UPDATES) * per_batch
+        trainer = make_trainer(words, run_dir)
+        options = trainer.options
+        per_batch = options.collector.frames_per_batch
+        options.collector.init_frames = 2 * options.replay_buffer.slice_len * options.env.num_envs
+        updates = warm_up_updates(options) + NUM_UPDATES
         with redirect_stdout(sys.stderr):
-            safetac_point.main.__wrapped__(cfg)
+            trainer.train(total_frames=updates * per_batch)
         metrics = read_metrics(Path(run_dir, "log"))
 
     def per_frame(seconds: np.ndarray) -> float:
@@ -92,17 +89,19 @@ def training_cost(options: list[str]) -> dict[str, float]:
     return {PARTS[0]: whole - sum(parts.values()), **parts}
 
 
-def replay_cost(options: list[str], frames: int) -> dict[str, float]:
+def replay_cost(words: list[str], frames: int) -> dict[str, float]:
     """Microseconds per replayed frame of drawing slices from that many frames."""
+    sampled = f"optim.critic_frames={min(frames, 15_000)}"
     with tempfile.TemporaryDirectory() as run_dir:
-        cfg = configuration([*options, f"replay_buffer.size={frames}"], run_dir)
-        per_batch = cfg.collector.frames_per_batch
-        make = partial(make_env, cfg, episode_length=cfg.env.episode_length, stagger=True)
-        policy = make_policy(cfg, make(num_envs=1, seed=0))
-        collector = make_collector(cfg, make, policy, seed=0, total_frames=per_batch)
-        batch = next(iter(collector)).select(*REPLAYED)
+        trainer = make_trainer([*words, f"replay_buffer.size={frames}", sampled], run_dir)
+        options = trainer.options
+        per_batch = options.collector.frames_per_batch
+        make = partial(trainer.make_env, training=True)
+        policy = trainer.make_policy(make(num_envs=1, seed=0))
+        collector = make_collector(options, make, policy, seed=0, total_frames=per_batch)
+        batch = next(iter(collector)).select(*replayed(trainer))
         collector.shutdown()
-        buffer = make_buffer(cfg)
+        buffer = make_slice_buffer(trainer)
         for number in range(-(-frames // per_batch)):
             batch = batch.clone()
             batch["collector", "traj_ids"] += number  # other trajectories than before
@@ -110,9 +109,9 @@ def replay_cost(options: list[str], frames: int) -> dict[str, float]:
         seconds = []
         for _ in range(1 + NUM_UPDATES):
             start = time.perf_counter()
-            buffer.sample(cfg.optim.critic_frames)
+            buffer.sample(options.optim.critic_frames)
             seconds.append(time.perf_counter() - start)
-    return {"sample": 1e6 * statistics.median(seconds[1:]) / cfg.optim.critic_frames}
+    return {"sample": 1e6 * statistics.median(seconds[1:]) / options.optim.critic_frames}
 
 
 def measure(options: list[str]) -> Iterator[tuple[str, int, str, float]]:

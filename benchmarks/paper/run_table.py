@@ -28,8 +28,10 @@ from typing import NamedTuple
 
 ROOT = Path(__file__).parents[2]
 
-SAFETAC = ("safetac_point", "policy.num_components=1")
-MIXTURE = ("safetac_point", "loss.entropic_index=1.2")
+# Where the limit starts, also where it ends at another one than the default.
+FALLING = ("safetac_point", "loss.initial_cost_limit=15")
+SAFETAC = (*FALLING, "policy.num_components=1")
+MIXTURE = (*FALLING, "loss.entropic_index=1.2")
 # A limit that falls starves a multiplier, so theirs is the same throughout.
 MULTIPLIER = (*SAFETAC, "loss.entropic_index=1.0", "loss.initial_cost_limit=${loss.cost_limit}")
 METHODS: dict[str, tuple[str, ...]] = {

@@ -4,18 +4,16 @@
     python benchmarks/paper/table_2.py runs/paper/jackal benchmarks/results/paper/jackal
 
 Ten episodes of each run in ``<method>_randomized/seed_<n>`` on ``JACKAL_REAL``, by
-examples/evaluate.py. The paper drove a real robot, and this is not one.
+``torchrl-safe evaluate``. The paper drove a real robot, and this is not one.
 """
 
 from __future__ import annotations
 
 import argparse
-import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-sys.path.insert(0, str(Path(__file__).parents[2] / "examples"))
-import evaluate
+from torchrl_safe.trainers.commands import evaluate
 
 NUM_EPISODES = 10
 SUFFIX = "_randomized"

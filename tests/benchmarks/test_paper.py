@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import json
-from pathlib import Path
 
-import hydra
 import make_table
 import numpy as np
 import prediction_error
@@ -15,17 +13,15 @@ import table_2
 import tiny
 from torchrl.record import CSVLogger
 
-from torchrl_safe.trainers import config
-
-ROOT = Path(__file__).parents[2]
+from torchrl_safe.trainers import cli
 
 
 class TestCells:
     @pytest.mark.parametrize("table", run_table.TABLES)
     def test_every_cell_is_a_valid_configuration(self, table):
         for cell in run_table.cells(table, ["point"], [0]):
-            with hydra.initialize_config_dir(str(ROOT / "examples"), version_base="1.3"):
-                config.check_config(hydra.compose(cell.script, list(cell.overrides)))
+            method = "safetac" if cell.script == "safetac_point" else cell.script
+            assert cli.compose(method, list(cell.overrides)).method == method
 
     @pytest.mark.parametrize("table", run_table.TABLES)
     def test_no_two_share_a_folder(self, table):

@@ -59,9 +59,11 @@ def shell_quoted(command):
 
 
 def test_a_look_is_the_innermost_parts_and_its_nearest_owners():
-    main = "MainThread;main (safetac_point.py:147);train (utils.py:160)"
-    update = f"{main};main.<locals>.update (safetac_point.py:122);CriticFit.__call__ (critics.py:9)"
-    descend = f"{update};CriticFit.__init__.<locals>.descend (critics.py:155)"
+    main = "MainThread;main (profile_training.py:80);Trainer._loop (trainer.py:160)"
+    update = f"{main};SafeTAC.update (safetac.py:160)"
+    step = f"{update};SafeTAC._step (safetac.py:170)"
+    fit = f"{update};CriticFit.__call__ (off_policy.py:9)"
+    descend = f"{fit};CriticFit.__init__.<locals>.descend (off_policy.py:155)"
     collect = f"{main};Collector.rollout (torchrl/collectors/_single.py:2)"
     forward = f"{descend};Module._call_impl (torch/nn/modules/module.py:1)"
     runner = f"Runner.call (c{'a1' * 25}b.py:3)"
@@ -74,12 +76,12 @@ def test_a_look_is_the_innermost_parts_and_its_nearest_owners():
         f"{descend};{runner};kernel (c{'a1' * 25}b.main.cpp:8) 1",
         f"{descend};{runner} 32",
         # A replay in it is a part of its own, the trust region whatever else an update does.
-        f"{update};ReplayBuffer.sample (torchrl/data/replay_buffers/base.py:1) 3",
-        f"{update};step (numpy/_core/_multiarray_umath.cpython-311-x86_64-linux-gnu.so) 5",
+        f"{fit};ReplayBuffer.sample (torchrl/data/replay_buffers/base.py:1) 3",
+        f"{step};step (numpy/_core/_multiarray_umath.cpython-311-x86_64-linux-gnu.so) 5",
         f"{collect};mj_step (mujoco/libmujoco.so.3.17.0) 7",
         f"{collect};mj_step (mujoco/libmujoco.so.3.17.0);sin (libm.so.6) 1",
         "MainThread;gc_collect_main (libpython3.11.so.1.0) 9",
-        "thread (0x1): Thread-1;train (utils.py:160);run (libtorch_cpu.so) 99",
+        "thread (0x1): Thread-1;Trainer._loop (trainer.py:160);run (libtorch_cpu.so) 99",
     ]
     seen = profile_training.attribute(stacks)
     assert {part.partition(":")[0]: dict(counts) for part, counts in seen.items()} == {

@@ -164,7 +164,7 @@ class TestController:
         found = torques(load_legs(tmp_path / "legs.safetensors"), x)
         np.testing.assert_allclose(found, td["action"].numpy(), atol=2e-5)
         with safe_open(tmp_path / "legs.safetensors", "np") as file:
-            assert file.metadata() == {"command": "python examples/doggo_controller.py seed=2"}
+            assert file.metadata() == {"command": "python benchmarks/doggo_controller.py seed=2"}
 
     def test_trained_on_what_the_robot_sees(self):
         """The task's observation and the robot's own input agree step by step."""

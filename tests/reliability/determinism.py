@@ -15,13 +15,16 @@ from functools import partial
 from pathlib import Path
 
 TESTS = Path(__file__).parents[1]
-sys.path[:0] = [str(TESTS.parent / "examples"), str(TESTS / "examples"), str(TESTS / "reliability")]
+sys.path[:0] = [
+    str(TESTS.parent / "examples"),
+    str(TESTS.parent / "benchmarks"),
+    *(str(TESTS / name) for name in ("trainers", "benchmarks", "reliability")),
+]
 
 import compose_constraint  # noqa: E402
 import compose_retrace  # noqa: E402
 import compose_trpo  # noqa: E402
 import compose_tsallis  # noqa: E402
-import hydra  # noqa: E402
 import numpy as np  # noqa: E402
 import retrace_sac  # noqa: E402
 import test_baselines as baselines  # noqa: E402
@@ -34,6 +37,7 @@ from torchrl.modules import MLP  # noqa: E402
 
 from torchrl_safe import GMMTanhPolicy  # noqa: E402
 from torchrl_safe.record import read_metrics  # noqa: E402
+from torchrl_safe.trainers import cli  # noqa: E402
 
 ENDS = ("terminated", "truncated", "running")
 TIMES = {"seconds", "frames_per_second"}
@@ -57,8 +61,7 @@ def run_retrace_sac(folder: Path) -> None:
         "eval.interval=300",
         "eval.num_episodes=1",
     ]
-    with hydra.initialize_config_dir(str(baselines.EXAMPLES), version_base="1.3"):
-        retrace_sac.main.__wrapped__(hydra.compose("retrace_sac", overrides))
+    retrace_sac.main(cli.compose("retrace_sac", overrides))
 
 
 def keep_episodes(train: Callable[..., list[tuple[int, float]]], folder: Path) -> None:
@@ -80,9 +83,9 @@ def run_compose_trpo(folder: Path, limit: float | None = None) -> None:
 
 
 CASES: dict[str, Callable[[Path], None]] = {
-    "safetac_point": lambda folder: tiny.launch(folder, *SAFETAC),
-    "safetac_point lagrangian": lambda folder: tiny.launch(folder, "update=lagrangian", *SAFETAC),
-    "safetac_point pid": lambda folder: tiny.launch(folder, "update=pid", *SAFETAC),
+    "safetac": lambda folder: tiny.launch(folder, *SAFETAC),
+    "safetac lagrangian": lambda folder: tiny.launch(folder, "update=lagrangian", *SAFETAC),
+    "safetac pid": lambda folder: tiny.launch(folder, "update=pid", *SAFETAC),
     **{
         name: partial(baseline, name)
         for name in ("tac", "wcsac", "sac_lagrangian", "cpo", "trc", "offpolicy_trc")

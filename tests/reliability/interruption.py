@@ -24,13 +24,13 @@ import traceback
 from collections import Counter
 from pathlib import Path
 
-sys.path[:0] = [str(Path(__file__).parents[2] / "examples"), str(Path(__file__).parent)]
+sys.path.insert(0, str(Path(__file__).parent))
 
-import numpy as np  # noqa: E402
-import tiny  # noqa: E402
+import numpy as np
+import tiny
 
-from torchrl_safe.record import read_metrics  # noqa: E402
-from torchrl_safe.trainers import checkpoints  # noqa: E402
+from torchrl_safe.record import read_metrics
+from torchrl_safe.trainers import checkpoints
 
 INTERVAL = 2 * tiny.FRAMES
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGKILL)

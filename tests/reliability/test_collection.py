@@ -19,7 +19,7 @@ from torch import nn
 
 from torchrl_safe.envs import SafeGoalEnv, get_robot
 from torchrl_safe.record import read_metrics
-from torchrl_safe.trainers import checkpoints, collectors, utils
+from torchrl_safe.trainers import checkpoints, collectors, trainer
 
 DIE = Path("die")  # whoever deletes it ends itself
 STEPS = 12  # that a simulation lives, longer than a replayed slice
@@ -35,14 +35,15 @@ def explode(action, qpos, qvel, time):
     return action
 
 
-def make_unstable_env(cfg, num_envs, seed, **kwargs):
+def make_unstable_env(options, num_envs, seed, training=False, **_):
+    length = {"episode_length": options.env.episode_length, "stagger": True} if training else {}
     robot = replace(get_robot("point"), control=explode)
-    return SafeGoalEnv(robot, num_envs=num_envs, num_threads=1, seed=seed, **kwargs)
+    return SafeGoalEnv(robot, num_envs=num_envs, num_threads=1, seed=seed, **length)
 
 
 @pytest.fixture(autouse=True)
 def unstable(monkeypatch, tmp_path):
-    monkeypatch.setattr(utils, "make_env", make_unstable_env)
+    monkeypatch.setattr(trainer, "make_env", make_unstable_env)
     monkeypatch.chdir(tmp_path)  # MuJoCo logs its warnings there
 
 
@@ -75,7 +76,7 @@ def test_instabilities_are_reset_counted_and_logged(tmp_path):
 @pytest.mark.parametrize("backend", ["multi_sync", "multi_async"])
 def test_a_killed_worker(tmp_path, monkeypatch, patience, backend):
     """While it waits, so that its receipt of new weights is missing; or in the middle of a step."""
-    run_dir, workers, count = tmp_path / "run", [], utils.count_violations
+    run_dir, workers, count = tmp_path / "run", [], trainer.count_violations
 
     def count_and_kill(batch):
         workers[:] = sorted(child.pid for child in multiprocessing.active_children())
@@ -87,7 +88,7 @@ def test_a_killed_worker(tmp_path, monkeypatch, patience, backend):
                 DIE.touch()
         return count(batch)
 
-    monkeypatch.setattr(utils, "count_violations", count_and_kill)
+    monkeypatch.setattr(trainer, "count_violations", count_and_kill)
     with pytest.raises(collectors.WorkerDied) as info:
         tiny.launch(run_dir, LONG, "collector.total_frames=2000", f"collector.backend={backend}")
     signal.alarm(0)
@@ -104,7 +105,7 @@ def test_a_killed_worker(tmp_path, monkeypatch, patience, backend):
     # Nothing is lost: it goes on, with fewer workers. A batch of multi_async is one worker's.
     saved = int(checkpoints.latest(run_dir).name.split("-")[1])
     assert saved >= 2 * tiny.FRAMES
-    monkeypatch.setattr(utils, "count_violations", count)
+    monkeypatch.setattr(trainer, "count_violations", count)
     tiny.launch(
         run_dir,
         LONG,
@@ -130,7 +131,7 @@ def test_an_error_ends_the_workers(tmp_path, monkeypatch, patience, backend):
         assert len(multiprocessing.active_children()) == 2
         raise OSError("no space left")
 
-    monkeypatch.setattr(utils, "batch_metrics", fail)
+    monkeypatch.setattr(trainer, "batch_metrics", fail)
     with pytest.raises(OSError, match="no space left") as info:
         tiny.launch(tmp_path / "run", f"collector.backend={backend}")
     assert not multiprocessing.active_children()
@@ -165,13 +166,13 @@ def test_a_killed_actor_of_ray(tmp_path, patience, when):
     os.environ.setdefault("RAY_raylet_start_wait_time_s", "300")
     ray.init(address="local", num_cpus=2, include_dashboard=False, object_store_memory=2**27)
     try:
-        cfg = tiny.config(tmp_path / "run", "collector.backend=ray")
+        options = tiny.options(tmp_path / "run", "collector.backend=ray")
         policy = TensorDictModule(
             nn.Sequential(nn.Linear(24, 2), nn.Tanh()), ["observation"], ["action"]
         )
         torch.manual_seed(0)
         collector = collectors.make_collector(
-            cfg, SafeGoalEnv, policy, seed=0, total_frames=10 * tiny.FRAMES
+            options, SafeGoalEnv, policy, seed=0, total_frames=10 * tiny.FRAMES
         )
         collector.update_policy_weights_()
         batches = iter(collector)

@@ -15,7 +15,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 from test_host_sync import HostReads
-from tiny import config, launch
+from tiny import launch, options
 from torch import nn
 from torchrl.data import Bounded
 from torchrl.modules import MLP, ValueOperator
@@ -26,12 +26,15 @@ from torchrl_safe import (
     TrustRegionSafeOptimizer,
     TsallisLoss,
 )
+from torchrl_safe.modules import DISTANCES, Distance
 from torchrl_safe.objectives.value import PolicyEvaluation, evaluate_policy
 from torchrl_safe.record import read_metrics
-from torchrl_safe.trainers import critics, utils
-from torchrl_safe.trainers.policy_steps import DISTANCES, MOMENT_MATCHED, Distance
+from torchrl_safe.trainers import SafeTAC
+from torchrl_safe.trainers import options as shared
+from torchrl_safe.trainers.off_policy import make_slice_buffer, minibatches, replayed
 
 OBS, ACT = 3, 2
+MOMENT_MATCHED = DISTANCES["moment_matched"]
 gpu = [
     pytest.mark.gpu,
     pytest.mark.skipif(not torch.cuda.is_available(), reason="there is no CUDA device"),
@@ -299,11 +302,11 @@ def test_cuda_graphs_learn_the_same(device, tmp_path):
     ends = []
     for graphs in (False, True):
         torch.manual_seed(0)
-        cfg = config(tmp_path, f"device={device}", f"optim.cuda_graphs={graphs}")
-        env = utils.make_env(cfg, 4, seed=0)
-        losses = critics.make_losses(cfg, env, utils.make_policy(cfg, env))
-        optim = critics.make_critic_optim(cfg, *losses)
-        fit = critics.CriticFit(cfg, critics.make_buffer(cfg), *losses, optim)
+        trainer = SafeTAC(
+            options=options(tmp_path, f"device={device}", f"optim.cuda_graphs={graphs}")
+        )
+        env = trainer.make_env(4, seed=0)
+        optim, fit = trainer.build(env)["critic_optim"], trainer.fit_critics
         data = TensorDict(
             observation=torch.randn(100, 24),
             action=torch.rand(100, env.action_spec.shape[-1]) * 2 - 1,
@@ -312,12 +315,12 @@ def test_cuda_graphs_learn_the_same(device, tmp_path):
         ).to(device)
         for _ in range(6):
             fit._descend(data.clone())
-        assert fit.descent.count() == 0
+        assert fit.steps.count() == 0
         before = [p.detach().clone() for p in optim.param_groups[0]["params"]]
         bad = data.clone()
         bad["cost_target"][7] = torch.nan
         fit._descend(bad)
-        assert fit.descent.count() == 1
+        assert fit.steps.count() == 1
         assert all(map(torch.equal, before, optim.param_groups[0]["params"]))
         fit._descend(data.clone())
         assert not any(map(torch.equal, before, optim.param_groups[0]["params"]))
@@ -336,20 +339,19 @@ def test_compiled_critics_learn_the_same(backend, tmp_path, monkeypatch):
     ends = []
     for compiled in (False, True):
         torch.manual_seed(0)
-        cfg = config(tmp_path, f"optim.compile={compiled}", "optim.minibatch_size=70")
-        env = utils.make_env(cfg, 4, seed=0)
-        policy = utils.make_policy(cfg, env)
-        losses = critics.make_losses(cfg, env, policy)
-        optim = critics.make_critic_optim(cfg, *losses)
-        buffer = critics.make_buffer(cfg)
-        with torch.no_grad():
-            batch = env.rollout(50, policy, break_when_any_done=False)
-        batch["collector", "traj_ids"] = torch.arange(4)[:, None].expand(4, 50).clone()
-        buffer.extend(batch.select(*critics.REPLAYED))
+        trainer = SafeTAC(
+            options=options(tmp_path, f"optim.compile={compiled}", "optim.minibatch_size=70")
+        )
+        env = trainer.make_env(4, seed=0)
         compile_ = partial(torch.compile, backend=backend, fullgraph=True)
         with monkeypatch.context() as patch:
             patch.setattr(torch, "compile", compile_)
-            fit = critics.CriticFit(cfg, buffer, *losses, optim)
+            optim = trainer.build(env)["critic_optim"]
+        fit = trainer.fit_critics
+        with torch.no_grad():
+            batch = env.rollout(50, trainer.policy, break_when_any_done=False)
+        batch["collector", "traj_ids"] = torch.arange(4)[:, None].expand(4, 50).clone()
+        trainer.buffer.extend(batch.select(*replayed(trainer)))
         before = [p.detach().clone() for p in optim.param_groups[0]["params"]]
         for _ in range(3):
             assert fit()["update/skipped_steps"] == 0
@@ -360,7 +362,7 @@ def test_compiled_critics_learn_the_same(backend, tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("device", [GPU])
-def test_a_run_of_the_example(device, tmp_path):
+def test_a_run(device, tmp_path):
     """With CUDA graphs: several updates, a checkpoint, and a resumed run from it."""
     launch(
         tmp_path / "run",
@@ -375,24 +377,24 @@ def test_a_run_of_the_example(device, tmp_path):
     assert torch.as_tensor(losses).isfinite().all()
 
 
-def test_networks_and_replay_of_the_example(tmp_path):
-    """They are made on ``device``; ``meta`` stands in for a GPU."""
-    cfg = config(tmp_path)
-    env = utils.make_env(cfg, 2, seed=0)
+def test_networks_and_replay_are_on_the_device(tmp_path, monkeypatch):
+    """``meta`` stands in for a GPU."""
+    trainer = SafeTAC(options=options(tmp_path))
+    env = trainer.make_env(2, seed=0)
     assert env.device == torch.device("cpu")
-    cfg.device = "meta"
-    networks = utils.make_policy(cfg, env), utils.make_critic(cfg, env, "cost_value")
+    assert not any(p.is_meta for p in trainer.make_policy(env).parameters())
+    monkeypatch.setattr(shared, "devices", lambda: ["meta"])
+    trainer.options.device = "meta"
+    networks = trainer.make_policy(env), trainer.make_critic(env, "cost_value")
     assert all(p.is_meta for network in networks for p in network.parameters())
-    assert critics.make_buffer(cfg).storage.device == torch.device("meta")
-    cfg.device = "cpu"
-    assert not any(p.is_meta for p in utils.make_policy(cfg, env).parameters())
+    assert make_slice_buffer(trainer).storage.device == torch.device("meta")
 
 
 def test_minibatches_are_drawn_where_the_data_is():
     data = TensorDict(x=torch.arange(10.0), batch_size=[10])
-    parts = list(critics.minibatches(data, 4))
+    parts = list(minibatches(data, 4))
     assert [len(part) for part in parts] == [4, 4, 2]
     assert torch.cat([part["x"] for part in parts]).sort().values.equal(data["x"])
     assert not torch.cat([part["x"] for part in parts]).equal(data["x"])
-    (part,) = critics.minibatches(data.to("meta"), 10)  # an order on the CPU would raise
+    (part,) = minibatches(data.to("meta"), 10)  # an order on the CPU would raise
     assert part["x"].is_meta

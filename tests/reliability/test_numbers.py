@@ -3,25 +3,25 @@
 from __future__ import annotations
 
 import copy
-import importlib
 import itertools
 import math
-from pathlib import Path
 
-import hydra
 import pytest
-import safetac_point
 import torch
 from torch.utils._pytree import tree_leaves
 
 from torchrl_safe import record
-from torchrl_safe.trainers import critics, policy_steps, utils
-from torchrl_safe.trainers.policy_steps import MATCHED_BOUND
+from torchrl_safe.modules import DISTANCES
+from torchrl_safe.trainers import METHODS, SafeTAC, cli, trainer
+from torchrl_safe.trainers.off_policy import replayed
 
+MATCHED_BOUND = DISTANCES["matched_bound"]
 TINY = [
     "num_threads=1",
     "env.num_envs=4",
     "env.episode_length=50",
+    "collector.frames_per_batch=200",
+    "collector.init_frames=0",
     "replay_buffer.size=1000",
     "replay_buffer.slice_len=10",
     "policy.num_cells=[8]",
@@ -29,43 +29,35 @@ TINY = [
     "optim.critic_rounds=1",
     "optim.critic_frames=100",
     "optim.minibatch_size=50",
+    "optim.kl=matched_bound",
 ]
 
 
 class Update:
-    """One update of the example, with all that it may change."""
+    """One update of SafeTAC, with all that it may change."""
 
     def __init__(self) -> None:
         torch.manual_seed(0)
-        with hydra.initialize_config_dir(
-            str(Path(safetac_point.__file__).parent), version_base="1.3"
-        ):
-            self.cfg = hydra.compose("safetac_point", TINY)
-        env = utils.make_env(self.cfg, 4, seed=0)
-        self.policy = utils.make_policy(self.cfg, env)
-        self.losses = critics.make_losses(self.cfg, env, self.policy)
-        self.critic_optim = critics.make_critic_optim(self.cfg, *self.losses)
-        self.policy_optim = policy_steps.make_trust_region(self.cfg, self.policy, MATCHED_BOUND)
+        self.trainer = SafeTAC(options=cli.compose("safetac", TINY))
+        env = self.trainer.make_env(4, seed=0)
+        self.critic_optim = self.trainer.build(env)["critic_optim"]
+        self.policy = self.trainer.policy
+        self.losses = (self.trainer.reward_loss, self.trainer.cost_losses["cost"])
         with torch.no_grad():  # as collectors do
             self.batch = env.rollout(50, self.policy, break_when_any_done=False)
         self.batch["collector", "traj_ids"] = torch.arange(4)[:, None].expand(4, 50).clone()
         self.fit(self.batch)  # Adam has moments to lose
 
     def fit(self, batch):
-        buffer = critics.make_buffer(self.cfg)
-        buffer.extend(batch.select(*critics.REPLAYED))
-        return critics.CriticFit(self.cfg, buffer, *self.losses, self.critic_optim)()
+        self.trainer.buffer.empty()
+        self.trainer.buffer.extend(batch.select(*replayed(self.trainer)))
+        return self.trainer.fit_critics()
 
     def step(self, batch):
-        return self.policy_optim.step(
-            safetac_point.policy_closure(
-                self.policy,
-                *self.losses,
-                batch.select("observation").flatten(),
-                batch,
-                distance=MATCHED_BOUND,
-            )
-        )
+        limits = self.trainer.limits()
+        states = batch.select("observation").flatten()
+        closure = self.trainer.policy_closure(states, limits, batch, distance=MATCHED_BOUND)
+        return self.trainer.trust_region.step(closure)
 
     def state(self):
         parts = (*self.losses, self.policy, self.critic_optim)
@@ -117,11 +109,10 @@ def test_gradients(update, bad):
 
 
 def test_stops_by_configuration(update, monkeypatch):
-    monkeypatch.setattr(update, "cfg", copy.deepcopy(update.cfg))
-    update.cfg.optim.max_skipped = 0
+    monkeypatch.setattr(update.trainer.fit_critics.steps, "max_skipped", 0)
     batch, state = update.batch.clone(), update.state()
     batch["next", "reward"].fill_(math.nan)
-    with pytest.raises(FloatingPointError, match=r"optim.max_skipped=0: .*'loss_qvalue': nan"):
+    with pytest.raises(FloatingPointError, match=r"max_skipped=0: .*'loss_qvalue': nan"):
         update.fit(batch)
     assert update.is_at(state)
 
@@ -151,25 +142,21 @@ def test_critic_outputs(update, critic, bad):
 
 @BAD
 @pytest.mark.parametrize("where", ["curvature", "gradient"])
-def test_curvature_products_and_policy_gradients(update, bad, where):
+def test_curvature_products_and_policy_gradients(update, monkeypatch, bad, where):
     state = update.state()
 
     def spoiled(old, new):
-        kl = policy_steps.bound_kl(old, new)
+        kl = MATCHED_BOUND.kl(old, new)
         if new["loc"].requires_grad and where == "curvature":
             new["loc"].register_hook(lambda grad: grad * bad)
         return kl
 
     param = next(update.policy.parameters())
     hook = param.register_hook(lambda grad: grad * bad if where == "gradient" else grad)
-    optim = policy_steps.make_trust_region(update.cfg, update.policy, MATCHED_BOUND)
-    optim.statistics_kl = spoiled
-    good, update.policy_optim = update.policy_optim, optim
-    try:
-        report = update.step(update.batch)
-    finally:
-        update.policy_optim = good
-        hook.remove()
+    monkeypatch.setattr(update.trainer.trust_region, "statistics_kl", spoiled)
+    report = update.step(update.batch)
+    monkeypatch.undo()
+    hook.remove()
     if where == "curvature" or not report.accepted:
         assert not report.accepted
         assert report.reason == "a gradient or a product with the curvature is not finite"
@@ -178,7 +165,7 @@ def test_curvature_products_and_policy_gradients(update, bad, where):
     assert not update.is_at(state)
 
 
-class TestScripts:
+class TestMethods:
     """A reward that is not a number enters the second batch of a run, and of its replay buffer."""
 
     @pytest.fixture
@@ -190,7 +177,7 @@ class TestScripts:
                 batch["next", "reward"].fill_(math.nan)
             return record.count_violations(batch)
 
-        monkeypatch.setattr(utils, "count_violations", count_violations)
+        monkeypatch.setattr(trainer, "count_violations", count_violations)
 
     COMMON = (
         "num_threads=1 env.num_envs=4 env.episode_length=50 collector.frames_per_batch=200 "
@@ -202,26 +189,22 @@ class TestScripts:
     SURROGATE = "optim.critic_rounds=1 optim.minibatch_size=100"
     REPLAY = "replay_buffer.size=2000 optim.critic_frames=200 optim.policy_frames=200"
 
-    SCRIPTS = pytest.mark.parametrize(
+    METHOD = pytest.mark.parametrize(
         ("name", "overrides"),
         [
             ("tac", GRADIENT),
             ("wcsac", GRADIENT),
             ("trc", SURROGATE),
             ("offpolicy_trc", f"{SURROGATE} {REPLAY}"),
-            ("safetac_point", f"{SURROGATE} {REPLAY} update=pid"),
+            ("safetac", f"{SURROGATE} {REPLAY} update=pid"),
         ],
     )
 
     def launch(self, name, run_dir, overrides):
-        with hydra.initialize_config_dir(
-            str(Path(safetac_point.__file__).parent), version_base="1.3"
-        ):
-            options = f"run_dir={run_dir} {self.COMMON} {overrides}".split()
-            cfg = hydra.compose(name, options)
-        importlib.import_module(name).main.__wrapped__(cfg)
+        words = f"run_dir={run_dir} {self.COMMON} {overrides}".split()
+        METHODS[name](options=cli.compose(name, words)).train()
 
-    @SCRIPTS
+    @METHOD
     def test_goes_on(self, spoiled, tmp_path, name, overrides):
         run_dir = tmp_path / "run"
         self.launch(name, run_dir, overrides)
@@ -234,7 +217,7 @@ class TestScripts:
                 numbers = torch.from_file(str(file), size=file.stat().st_size // 4)
                 assert numbers.isfinite().all(), file
 
-    @SCRIPTS
+    @METHOD
     def test_stops_by_configuration(self, spoiled, tmp_path, name, overrides):
-        with pytest.raises(FloatingPointError, match=r"optim.max_skipped=0: .*losses .*nan"):
+        with pytest.raises(FloatingPointError, match=r"max_skipped=0: .*losses .*nan"):
             self.launch(name, tmp_path / "run", f"{overrides} optim.max_skipped=0")

@@ -17,23 +17,23 @@ import time
 from pathlib import Path
 from types import SimpleNamespace
 
-import evaluate
-import export
 import numpy as np
 import pytest
 import run_exported
 import tiny
-import watch
-from omegaconf import OmegaConf
 from torchrl.checkpoint import CheckpointError
 
 from torchrl_safe import _files
-from torchrl_safe.trainers import checkpoints, saved, utils
+from torchrl_safe.envs import SafeGoalEnv
+from torchrl_safe.trainers import checkpoints, load_policy, saved, saved_policies, trainer
+from torchrl_safe.trainers.commands import evaluate, export, play, watch
+from torchrl_safe.trainers.environments import UntrustedError
+from torchrl_safe.trainers.run import Run as OriginalRun
 
 REPOSITORY = Path(__file__).parents[2]
 
 
-class Run(utils.Run):
+class Run(OriginalRun):
     """Remembers what a script made."""
 
     def __init__(self, *args, **kwargs):
@@ -46,7 +46,7 @@ def trained(tmp_path_factory):
     """A finished run; what loads its checkpoint is in ``Run.last``."""
     run_dir = tmp_path_factory.mktemp("runs") / "run"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(tiny.safetac_point, "Run", Run)
+        patch.setattr(trainer, "Run", Run)
         tiny.launch(run_dir, "collector.total_frames=200")
     return run_dir
 
@@ -179,12 +179,12 @@ def test_metadata_that_asks_for_a_pickle(run_dir, tmp_path):
         (state / "meta.json").write_text(outer)
         reseal(run_dir, "policy")
         with pytest.raises(CheckpointError, match="may run code"):
-            utils.load_policy(run_dir)
+            load_policy(run_dir)
     for folder in (state, evil):  # the metadata alone is refused, too
         (folder / "other.pickle").unlink()
     reseal(run_dir, "policy")
     with pytest.raises(CheckpointError, match="may run code"):
-        utils.load_policy(run_dir)
+        load_policy(run_dir)
     assert not marker.exists()
 
 
@@ -206,7 +206,7 @@ def test_linked_folder_of_any_name(run_dir, tmp_path, name, where):
     link.unlink(missing_ok=True)
     link.symlink_to(os.path.relpath(elsewhere, link.parent))
     with pytest.raises(CheckpointError, match=f"{name} must be a regular file, and is a link"):
-        utils.load_policy(run_dir)
+        load_policy(run_dir)
     assert not marker.exists()
 
 
@@ -237,7 +237,7 @@ def test_folder_that_cannot_be_listed(run_dir, monkeypatch):
 
     monkeypatch.setattr(os, "scandir", refuse)
     with pytest.raises(CheckpointError, match="hidden cannot be listed: Permission denied"):
-        utils.load_policy(run_dir)
+        load_policy(run_dir)
 
 
 def paths_on_the_way(run_dir: Path) -> list[Path]:
@@ -259,15 +259,15 @@ def test_links_are_followed_nowhere(run_dir, tmp_path):
         path.rename(away)
         path.symlink_to(away)
         with pytest.raises(CheckpointError, match=f"{path.name} must be .*, and is a link"):
-            utils.load_policy(run_dir)
+            load_policy(run_dir)
         path.unlink()
         away.rename(path)
-    utils.load_policy(run_dir)
+    load_policy(run_dir)
 
 
 def test_a_run_may_lie_behind_a_link(run_dir, tmp_path):
     (tmp_path / "link").symlink_to(run_dir)
-    utils.load_policy(tmp_path / "link")
+    load_policy(tmp_path / "link")
 
 
 @pytest.mark.parametrize("kind", ["pipe", "socket"])
@@ -284,7 +284,7 @@ def test_nothing_waits_for_what_is_no_file(run_dir, kind):
             with socket.socket(socket.AF_UNIX) as server, contextlib.chdir(path.parent):
                 server.bind(path.name)
         with pytest.raises(CheckpointError, match=f"{path.name} must be .*, and is a {kind}"):
-            utils.load_policy(run_dir)
+            load_policy(run_dir)
         path.unlink()
         path.write_bytes(whole)
     os.mkfifo(run_dir / "log" / "scalars" / "x.csv")
@@ -301,7 +301,7 @@ def test_huge_files_are_not_read(run_dir):
         whole = path.read_bytes()
         os.truncate(path, 2**40)
         with pytest.raises(CheckpointError, match=r"is larger than|the most that there can be"):
-            utils.load_policy(run_dir)
+            load_policy(run_dir)
         path.unlink()
         path.write_bytes(whole)
     os.truncate(run_dir / "log" / "scalars" / "train" / "cv_rate.csv", 2**40)
@@ -337,7 +337,7 @@ def test_shapes_that_would_lengthen_a_file(run_dir, change, match):
     reseal(run_dir, "policy")
     sizes = {file: file.stat().st_size for file in folder.iterdir()}
     with pytest.raises(CheckpointError, match=match):
-        utils.load_policy(run_dir)
+        load_policy(run_dir)
     assert {file: file.stat().st_size for file in folder.iterdir()} == sizes
 
 
@@ -349,7 +349,7 @@ def test_metadata_that_names_other_files(run_dir, tmp_path, key):
         (folder / "meta.json").write_text(json.dumps(meta | {key: entry}))
         reseal(run_dir, "policy")
         with pytest.raises(CheckpointError, match="an impossible key") as caught:
-            utils.load_policy(run_dir)
+            load_policy(run_dir)
         assert "\x1b" not in str(caught.value)
 
 
@@ -387,7 +387,7 @@ def test_state_that_is_more_than_data(run_dir, entry):
     file.write_text(json.dumps(schema))
     reseal(run_dir, "policy")
     with pytest.raises(CheckpointError, match="cannot be read"):
-        utils.load_policy(run_dir)
+        load_policy(run_dir)
 
 
 @pytest.mark.parametrize("text", ["[" * 200_000, '{"kind": 1, "kind": 2}', "\xff", "{} {}", ""])
@@ -402,7 +402,7 @@ def test_json_that_is_none(run_dir, text):
         if file.name != "manifest.json":
             reseal(run_dir, "policy")
         with pytest.raises(CheckpointError, match=f"{file.name} is (no JSON|nested too deep)"):
-            utils.load_policy(run_dir)
+            load_policy(run_dir)
         file.write_bytes(whole)
 
 
@@ -412,16 +412,16 @@ def test_missing_or_foreign_digests(run_dir, tmp_path):
     digests = (folder / checkpoints.DIGESTS).read_bytes()
     (folder / checkpoints.DIGESTS).unlink()
     with pytest.raises(CheckpointError, match=r"digests\.json is missing"):
-        utils.load_policy(run_dir)
+        load_policy(run_dir)
     (folder / checkpoints.DIGESTS).write_bytes(digests)
-    utils.load_policy(run_dir)
+    load_policy(run_dir)
 
     other = tmp_path / "other"
     tiny.launch(other, "collector.total_frames=100", "seed=5")
     shutil.move(folder, tmp_path / "own")
     shutil.copytree(components(other)["policy"], folder)
     with pytest.raises(CheckpointError, match=f"{folder / 'digests.json'} is not what was written"):
-        utils.load_policy(run_dir)
+        load_policy(run_dir)
 
     manifest = checkpoints.latest(run_dir) / "manifest.json"
     content = json.loads(manifest.read_text())
@@ -429,7 +429,7 @@ def test_missing_or_foreign_digests(run_dir, tmp_path):
         content["metadata"]["digests"] = digests
         manifest.write_text(json.dumps(content))
         with pytest.raises(CheckpointError, match=r"no digests|is not what was written"):
-            utils.load_policy(run_dir)
+            load_policy(run_dir)
 
 
 def test_digests_that_name_files_outside(run_dir, tmp_path):
@@ -445,7 +445,7 @@ def test_digests_that_name_files_outside(run_dir, tmp_path):
         content["metadata"]["digests"]["policy"] = checkpoints.digest(folder / checkpoints.DIGESTS)
         manifest.write_text(json.dumps(content))
         with pytest.raises(CheckpointError, match="is not what was written"):
-            utils.load_policy(run_dir)
+            load_policy(run_dir)
 
 
 @pytest.mark.parametrize("path", ["..", "components/..", "components/../..", "/etc", "components"])
@@ -455,18 +455,18 @@ def test_manifest_that_leads_elsewhere(run_dir, path):
     content["components"]["policy"]["path"] = path
     manifest.write_text(json.dumps(content))
     with pytest.raises(CheckpointError, match=r"policy|Unsafe"):
-        utils.load_policy(run_dir)
+        load_policy(run_dir)
 
 
 def test_every_flipped_bit(run_dir, monkeypatch):
     """Of what a policy is read from: refused, or a bit that changes nothing."""
-    expected = utils.load_policy(run_dir).state_dict()
+    expected = load_policy(run_dir).state_dict()
     manifest = checkpoints.latest(run_dir) / "manifest.json"
     folders = (components(run_dir)[name] for name in ("policy", "config"))
     files = [file for folder in folders for file in folder.rglob("*") if file.is_file()]
-    policy = utils.saved_policy(*utils.load_run(run_dir))
-    monkeypatch.setattr(utils, "make_env", lambda *_, **__: None)
-    monkeypatch.setattr(utils, "make_policy", lambda *_: policy.requires_grad_(True))
+    policy = load_policy(run_dir)
+    monkeypatch.setattr(saved_policies, "make_env", lambda *_, **__: None)
+    monkeypatch.setattr(saved_policies, "make_policy", lambda *_: policy.requires_grad_(True))
     refused = 0
     for file in (manifest, *files):
         whole = file.read_bytes()
@@ -475,7 +475,7 @@ def test_every_flipped_bit(run_dir, monkeypatch):
             flipped[position] ^= 1 << position % 8
             file.write_bytes(flipped)
             try:
-                read = utils.load_policy(run_dir).state_dict()
+                read = load_policy(run_dir).state_dict()
             except CheckpointError:
                 refused += 1
             else:
@@ -493,17 +493,17 @@ def test_policy_that_does_not_fit(run_dir, tmp_path):
     shutil.copytree(components(other)["policy"], components(run_dir)["policy"])
     reseal(run_dir, "policy")
     with pytest.raises(CheckpointError, match="size mismatch"):
-        utils.load_policy(run_dir)
+        load_policy(run_dir)
     weights = components(other)["policy"] / "state" / "tensor_00000000.memmap"
     weights.write_bytes(np.full(9 * 24, np.nan, np.float32).tobytes())
     reseal(other, "policy")
     with pytest.raises(CheckpointError, match="is not finite"):
-        utils.load_policy(other)
+        load_policy(other)
 
 
 def change_config(run_dir: Path, **options: object) -> None:
     """The checkpoint's configuration with other options, sealed; dots in names are ``__``."""
-    _, checkpoint = utils.load_run(run_dir)
+    _, checkpoint = saved.load_run(run_dir)
     config = saved.Configuration()
     checkpoints.load_components(checkpoint, config=config)
     for name, value in options.items():
@@ -522,16 +522,17 @@ def change_config(run_dir: Path, **options: object) -> None:
 @pytest.mark.parametrize(
     ("options", "match"),
     [
-        ({"env__robot": "${oc.env:SECRET}"}, "refers to something else"),
-        ({"${oc.env:SECRET}": 1}, "refers to something else"),
+        ({"env__robot": "${oc.env:SECRET}"}, "env.robot must be one of"),
+        ({"${oc.env:SECRET}": 1}, "is not an option"),
+        ({"method": "os:system"}, "method must be one of"),
         ({"env__robot": "\x1b[2J"}, "env.robot must be one of"),
         ({"\x1b[2J": 1}, "impossible key"),
         ({"unknown": 1}, "unknown is not an option"),
         ({"policy__num_cells": [10**9, 10**9]}, "must be of at most"),
         ({"policy__num_components": 10**9}, "must be at most"),
         ({"eval__num_steps": 10**12}, "at most"),
-        ({"env": "point"}, "env is not an option"),
-        ({"policy": None}, "policy is not an option"),
+        ({"env": "point"}, "env must be a group of options"),
+        ({"policy": None}, "policy must be a group of options"),
     ],
 )
 def test_configuration_that_asks_for_too_much(run_dir, monkeypatch, options, match):
@@ -539,15 +540,43 @@ def test_configuration_that_asks_for_too_much(run_dir, monkeypatch, options, mat
     monkeypatch.setenv("SECRET", "hunter2")
     change_config(run_dir, **options)
     with pytest.raises(CheckpointError, match=match) as caught:
-        utils.load_policy(run_dir)
+        load_policy(run_dir)
     assert "\x1b" not in str(caught.value)
     assert "hunter2" not in str(caught.value)
 
 
+def test_code_that_a_configuration_names_is_not_imported(run_dir, tmp_path, monkeypatch):
+    """Unless whoever looks says that it is trusted; another environment needs no trust."""
+    marker = tmp_path / "marker"
+    (tmp_path / "stranger.py").write_text(
+        f"import pathlib\npathlib.Path({str(marker)!r}).touch()\n"
+        "from torchrl_safe.envs import SafeGoalEnv\n"
+        "def make(num_envs, seed):\n    return SafeGoalEnv('point', num_envs=num_envs, seed=seed)\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    expected = load_policy(run_dir).state_dict()
+    change_config(run_dir, env__name="stranger:make")
+    looks = (
+        load_policy,
+        export.main,
+        lambda run_dir: evaluate.main(run_dir, 1, 0, film=False),
+        lambda run_dir: play.main(str(run_dir), 1),
+    )
+    for look in looks:
+        with pytest.raises(UntrustedError, match=r"names code, env.name=stranger:make"):
+            look(run_dir)
+    ours = load_policy(run_dir, lambda num_envs: SafeGoalEnv("point", num_envs=num_envs))
+    assert not marker.exists()
+    theirs = load_policy(run_dir, trust=True)
+    assert marker.exists()
+    for policy in (ours, theirs):
+        assert all(policy.state_dict()[name].equal(expected[name]) for name in expected)
+
+
 def test_threads_are_those_of_this_machine(run_dir):
     change_config(run_dir, num_threads=10**6)
-    cfg, _ = utils.load_run(run_dir)
-    assert cfg.num_threads == os.cpu_count()
+    options, _ = saved.load_run(run_dir)
+    assert options.num_threads == os.cpu_count()
 
 
 BOMB = "a0: &a [x, x, x, x, x, x, x, x, x, x]\n" + "".join(
@@ -566,7 +595,6 @@ BOMB = "a0: &a [x, x, x, x, x, x, x, x, x, x]\n" + "".join(
         "a: 1\na: 2\n",
         "[" * 10_000,
         "a: [\n",
-        "a: ${oc.env:SECRET}\n",
         "- 1\n",
         "a: \x1b[2J\n",
         "",
@@ -579,9 +607,7 @@ def test_configuration_is_plain_yaml(tmp_path, monkeypatch, text):
     seal = hashlib.sha256(text.encode()).hexdigest()
     path.write_text(f"{text}{saved.SEAL.decode()}{seal}\n")
     started = time.monotonic()
-    with pytest.raises(
-        CheckpointError, match=r"config\.yaml (is no plain|holds no|refers)"
-    ) as caught:
+    with pytest.raises(CheckpointError, match=r"config\.yaml (is no plain|holds no)") as caught:
         saved.read_config(path)
     assert time.monotonic() - started < 60
     assert "\x1b" not in str(caught.value)
@@ -592,7 +618,7 @@ def test_configuration_is_sealed(run_dir, tmp_path):
     """Whatever bit of it flips; and a policy does not depend on it, its checkpoint has its own."""
     path = run_dir / "config.yaml"
     whole = path.read_bytes()
-    expected = utils.load_policy(run_dir).state_dict()
+    expected = load_policy(run_dir).state_dict()
     for position in range(len(whole) - 1):
         flipped = bytearray(whole)
         flipped[position] ^= 1 << position % 8
@@ -600,7 +626,7 @@ def test_configuration_is_sealed(run_dir, tmp_path):
         with pytest.raises(CheckpointError, match=f"{path} is not what was written"):
             saved.read_config(path)
     path.write_bytes(payload(tmp_path / "marker"))
-    read = utils.load_policy(run_dir).state_dict()
+    read = load_policy(run_dir).state_dict()
     assert all(read[name].equal(expected[name]) for name in expected)
     assert not (tmp_path / "marker").exists()
 
@@ -614,7 +640,7 @@ def test_configuration_is_sealed(run_dir, tmp_path):
     ],
 )
 def test_configuration_comes_back(tmp_path, options):
-    saved.write_config(tmp_path / "config.yaml", OmegaConf.create(options))
+    saved.write_config(tmp_path / "config.yaml", SimpleNamespace(settings=lambda: options))
     assert saved.read_config(tmp_path / "config.yaml") == options
 
 
@@ -622,7 +648,7 @@ def test_broken_manifest_ends_a_resumption(run_dir, tmp_path):
     marker = tmp_path / "marker"
     (checkpoints.latest(run_dir) / "manifest.json").write_bytes(payload(marker))
     with pytest.raises(CheckpointError, match=r"the manifest of .*checkpoint-000000000200"):
-        utils.load_policy(run_dir)
+        load_policy(run_dir)
     with pytest.raises(CheckpointError, match="the manifest of"):
         tiny.launch(run_dir, "resume=true", "collector.total_frames=300")
     assert not marker.exists()
@@ -723,8 +749,8 @@ def test_names_are_printed_escaped(run_dir, tmp_path, capsys):
     (components(odd)["policy"] / ESCAPE).touch()
     messages = []
     for call in (
-        lambda: utils.load_policy(odd),
-        lambda: utils.load_policy(tmp_path / "missing" / ESCAPE),
+        lambda: load_policy(odd),
+        lambda: load_policy(tmp_path / "missing" / ESCAPE),
         lambda: watch.main(tmp_path / ESCAPE / "missing", every=1.0, once=True),
         lambda: run_exported.load(odd / "missing.onnx"),
     ):
@@ -767,7 +793,7 @@ sys.addaudithook(guard)
 
 
 def python(code: str, **kwargs) -> subprocess.CompletedProcess[str]:
-    path = os.pathsep.join([str(tiny.EXAMPLES), str(Path(__file__).parent), str(REPOSITORY)])
+    path = os.pathsep.join([str(Path(__file__).parent), str(REPOSITORY)])
     return subprocess.run(
         [sys.executable, "-c", code],
         capture_output=True,
@@ -837,7 +863,10 @@ def test_wandb_sends_nothing_unless_asked(tmp_path):
 
 @pytest.mark.parametrize("folder", ["torchrl_safe", "examples"])
 def test_source_has_no_way_to_run_strings(folder):
-    """No pickle, no unguarded torch.load, no eval or exec, no shell, no network."""
+    """No pickle, no unguarded torch.load, no eval or exec, no shell, no network.
+
+    Modules are imported by name in one place, which asks first.
+    """
     modules = {"pickle", "cloudpickle", "shelve", "marshal", "subprocess", "socket", "urllib"}
     modules |= {"requests", "http", "importlib.import_module"}
     for path in (REPOSITORY / folder).rglob("*.py"):
@@ -848,6 +877,8 @@ def test_source_has_no_way_to_run_strings(folder):
                 names = {node.module} | {f"{node.module}.{alias.name}" for alias in node.names}
             else:
                 names = set()
+            if path.name == "environments.py":
+                names -= {"importlib.import_module"}
             assert not names & modules, f"{path}:{node.lineno}"
             if isinstance(node, ast.Call):
                 call = ast.unparse(node.func)

@@ -4,14 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import hydra
-import safetac_point
-from omegaconf import DictConfig
+from torchrl_safe.trainers import SafeTAC, cli
 
-from torchrl_safe import trainers
-
-EXAMPLES = Path(safetac_point.__file__).parent
-CONFIGS = Path(trainers.__file__).parent
 FRAMES = 100  # per update
 OVERRIDES = [
     "num_threads=1",
@@ -36,10 +30,9 @@ OVERRIDES = [
 ]
 
 
-def config(run_dir: Path, *overrides: str) -> DictConfig:
-    with hydra.initialize_config_dir(str(CONFIGS), version_base="1.3"):
-        return hydra.compose("safetac_point", [f"run_dir={run_dir}", *OVERRIDES, *overrides])
+def options(run_dir: Path, *overrides: str) -> SafeTAC.Options:
+    return cli.compose("safetac", [*OVERRIDES, f"run_dir={run_dir}", *overrides])
 
 
 def launch(run_dir: Path, *overrides: str) -> None:
-    safetac_point.main.__wrapped__(config(run_dir, *overrides))
+    SafeTAC(options=options(run_dir, *overrides)).train()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import hydra
@@ -14,7 +14,7 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import DictConfig, OmegaConf
 
 from torchrl_safe.trainers.methods import METHODS
-from torchrl_safe.trainers.options import MethodOptions, flat
+from torchrl_safe.trainers.options import Options, flat
 
 # Hydra itself writes no folder and no log: run_dir has everything.
 HYDRA = {
@@ -35,10 +35,31 @@ def train(method: str, arguments: Sequence[str] | None = None, **defaults: Any) 
         arguments (sequence of str, optional): defaults to the process's.
         **defaults: other defaults of options of the top level.
     """
+
+    def go(options: Any) -> None:
+        METHODS[method](options=options).train()
+
+    run(method, go, arguments, **defaults)
+
+
+def run(
+    method: str,
+    go: Callable[[Any], None],
+    arguments: Sequence[str] | None = None,
+    **defaults: Any,
+) -> None:
+    """Do something with options of hydra's arguments, which may ask for several runs.
+
+    Args:
+        method (str): which an :class:`~torchrl_safe.trainers.options.Options` has.
+        go (callable): what is done with the options.
+        arguments (sequence of str, optional): defaults to the process's.
+        **defaults: other defaults of options of the top level.
+    """
     name = register(method, **defaults)
 
     def main(cfg: DictConfig) -> None:
-        METHODS[method](options=options_of(method, cfg, **defaults)).train()
+        go(options_of(method, cfg, **defaults))
 
     arguments = sys.argv[1:] if arguments is None else arguments
     before, sys.argv = sys.argv, [sys.argv[0], *map(spelled_out, arguments)]
@@ -48,7 +69,7 @@ def train(method: str, arguments: Sequence[str] | None = None, **defaults: Any) 
         sys.argv = before
 
 
-def compose(method: str, overrides: Sequence[str] = (), **defaults: Any) -> MethodOptions:
+def compose(method: str, overrides: Sequence[str] = (), **defaults: Any) -> Any:
     """The options of a method with overrides as on the command line."""
     overrides = [*map(spelled_out, overrides)]
     name = register(method, **defaults)
@@ -59,7 +80,7 @@ def compose(method: str, overrides: Sequence[str] = (), **defaults: Any) -> Meth
 
 def register(method: str, **defaults: Any) -> str:
     """Give hydra the defaults of a method; the name that it knows them by."""
-    settings = METHODS[method].Options().model_dump() | defaults
+    settings = Options.known[method]().model_dump() | defaults
     defaults_list = [
         "_self_",
         {"override hydra/job_logging": "none"},
@@ -71,7 +92,7 @@ def register(method: str, **defaults: Any) -> str:
 
 def options_of(
     method: str, cfg: DictConfig, overrides: Sequence[str] | None = None, **defaults: Any
-) -> MethodOptions:
+) -> Any:
     """Options of what hydra composed.
 
     Given are those that an override names, and those that differ from the defaults: a caller who
@@ -82,7 +103,7 @@ def options_of(
     words = OverridesParser.create().parse_overrides(list(overrides))
     keys = [word.key_or_group for word in words]
     values: Any = OmegaConf.to_container(cfg, resolve=True)
-    standard = dict(flat(METHODS[method].Options()))
+    standard = dict(flat(Options.known[method]()))
 
     def named(name: str) -> bool:
         return any(name == key or name.startswith(f"{key}.") for key in keys)
@@ -92,7 +113,7 @@ def options_of(
         for name, value in _leaves(values, standard)
         if named(name) or name not in standard or standard[name] != value
     }
-    return METHODS[method].Options.of(**given)
+    return Options.known[method].of(**given)
 
 
 def spelled_out(argument: str) -> str:

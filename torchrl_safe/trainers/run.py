@@ -291,7 +291,6 @@ class Run:
         policy: Callable[[TensorDictBase], TensorDictBase],
         stream: str,
     ) -> dict[str, TensorDictBase]:
-        loss = self.options.loss
         return {
             prefix: evaluate(
                 env,
@@ -299,7 +298,7 @@ class Run:
                 num_steps=self.options.eval.num_steps,
                 exploration_type=kind,
                 seed=stream_seed(stream),
-                cost_gamma=getattr(loss, "cost_gamma", loss.gamma),
+                cost_gamma=cost_gamma(self.options),
             )
             for prefix, kind in KINDS.items()
         }
@@ -353,6 +352,11 @@ class Run:
             except Exception as error:  # whatever it is, the results are written
                 say(f"no video: {error}")
         say(f"results: {self.path}")
+
+
+def cost_gamma(options: Any) -> float:
+    """The discount of a method's cost; that of the reward, where the method has no limit."""
+    return getattr(options.loss, "cost_gamma", options.loss.gamma)
 
 
 def write_results(path: Path, results: Mapping[str, Any]) -> None:

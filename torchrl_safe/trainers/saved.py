@@ -112,16 +112,7 @@ def load_run(run_dir: str | os.PathLike[str]) -> tuple[Options, Path]:
         raise FileNotFoundError(f"run_dir={printable(run_dir)} has no checkpoint yet.")
     config = Configuration()
     load_components(checkpoint, config=config)
-    settings = _plain_settings(checkpoint, config.saved)
-    try:
-        num_threads = min(settings.get("num_threads", 1), os.cpu_count() or 1)
-        options = Options.from_settings({**settings, "device": "cpu", "num_threads": num_threads})
-        _check_cost(options)
-    except (ValueError, TypeError) as error:
-        raise CheckpointError(
-            f"the configuration in {printable(checkpoint)} is none: {printable(error)}"
-        ) from None
-    return options, checkpoint
+    return options_to_look(checkpoint, config.saved), checkpoint
 
 
 def from_newest(run_dir: str | os.PathLike[str], read: Callable[[Options, Path], T]) -> T:
@@ -145,6 +136,28 @@ def from_newest(run_dir: str | os.PathLike[str], read: Callable[[Options, Path],
         except (CheckpointError, OSError):
             if checkpoint is None or os.path.lexists(checkpoint):
                 raise
+
+
+def options_to_look(path: Path, settings: Any) -> Any:
+    """Options of a file that anybody may have written, which a look at it can afford.
+
+    Args:
+        path (Path): the file or folder that they are from.
+        settings: as :meth:`~torchrl_safe.trainers.options.Options.settings` wrote them.
+
+    Raises:
+        CheckpointError: if they are none, or ask for too much.
+    """
+    settings = _plain_settings(path, settings)
+    try:
+        num_threads = min(settings.get("num_threads", 1), os.cpu_count() or 1)
+        options = Options.from_settings({**settings, "device": "cpu", "num_threads": num_threads})
+        _check_cost(options)
+    except (ValueError, TypeError) as error:
+        raise CheckpointError(
+            f"the configuration in {printable(path)} is none: {printable(error)}"
+        ) from None
+    return options
 
 
 def _plain_settings(path: Path, settings: Any) -> dict[str, Any]:

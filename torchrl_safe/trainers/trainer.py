@@ -9,7 +9,6 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import partial
-from pathlib import Path
 from typing import Any, ClassVar
 
 import torch
@@ -18,21 +17,17 @@ from tensordict.nn import ProbabilisticTensorDictSequential
 from torch import nn
 from torchrl._utils import logger as torchrl_logger
 from torchrl._utils import timeit
-from torchrl.checkpoint import CheckpointError
 from torchrl.collectors import BaseCollector
 from torchrl.envs import EnvBase
 
-from torchrl_safe._files import printable
 from torchrl_safe.envs import ROBOTS
 from torchrl_safe.optim.trust_region import TrustRegionReport
 from torchrl_safe.record import batch_metrics, count_violations
-from torchrl_safe.trainers.checkpoints import load_components
 from torchrl_safe.trainers.collectors import WorkerDied, make_collector
 from torchrl_safe.trainers.environments import cost_names, has_state, make_env, source_of
 from torchrl_safe.trainers.networks import MakeNetwork, is_discrete, make_critic, make_policy
 from torchrl_safe.trainers.options import ConstrainedLoss, MethodOptions
 from torchrl_safe.trainers.run import Run
-from torchrl_safe.trainers.saved import from_newest
 from torchrl_safe.trainers.streams import stream_seed
 from torchrl_safe.trainers.terminal import GracefulStop, progress_bar, say
 
@@ -365,42 +360,3 @@ def closing_down(collector: BaseCollector) -> Iterator[None]:
         yield
     finally:
         collector.shutdown()
-
-
-def load_policy(run_dir: str | os.PathLike[str], env: Any = None) -> Any:
-    """The policy of a run, as its newest checkpoint has it.
-
-    Nothing is unpickled: weights are read as tensors, everything else as JSON. No code that the
-    configuration names is imported.
-
-    Args:
-        run_dir (path): the run's folder.
-        env (EnvBase or callable, optional): the environment of a run in one that is not ours.
-
-    Raises:
-        FileNotFoundError: if it holds no run, or one without a checkpoint.
-        CheckpointError: if the checkpoint is not what was written, or could run code.
-        UntrustedError: if the environment is somebody's, and ``env`` is not given.
-    """
-    return from_newest(run_dir, partial(saved_policy, env=env))
-
-
-def saved_policy(
-    options: MethodOptions, checkpoint: Path, env: Any = None, *, trust: bool = False
-) -> Any:
-    """The policy of a checkpoint.
-
-    Raises:
-        CheckpointError: if it is not what was written, or not finite.
-        UntrustedError: if ``trust`` is false, the configuration names code and ``env`` is not
-            given.
-    """
-    if not isinstance(options, MethodOptions):
-        raise CheckpointError(f"{printable(checkpoint)} has no mixture policy.")
-    source = None if env is None else source_of(env)[0]
-    policy = make_policy(options, make_env(options, 1, 0, source=source, trust=trust))
-    load_components(checkpoint, policy=policy)
-    for name, weight in policy.named_parameters():
-        if not weight.isfinite().all():
-            raise CheckpointError(f"{name} of the policy in {printable(checkpoint)} is not finite.")
-    return policy.eval().requires_grad_(False)

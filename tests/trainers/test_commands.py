@@ -12,31 +12,38 @@ from collections import OrderedDict
 from pathlib import Path
 from types import SimpleNamespace
 
-import evaluate
-import export
 import numpy as np
 import pytest
 import run_exported
+import tiny
 import torch
-import watch
-from omegaconf import OmegaConf
 from tensordict import TensorDict
-from test_safetac_point import launch
 from torchrl.checkpoint import CheckpointError
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from torchrl_safe.modules import GMMTanhPolicy
-from torchrl_safe.trainers import checkpoints
-from torchrl_safe.trainers.saved import Configuration, read_config, write_config
+from torchrl_safe.trainers import checkpoints, load_policy
+from torchrl_safe.trainers.commands import evaluate, export, play, watch
+from torchrl_safe.trainers.environments import make_env
+from torchrl_safe.trainers.saved import Configuration, load_run, read_config, write_config
 from torchrl_safe.trainers.streams import stream_seed
-from torchrl_safe.trainers.utils import load_policy, load_run, make_env
 
 
 @pytest.fixture(scope="module")
 def run_dir(tmp_path_factory):
     path = tmp_path_factory.mktemp("runs") / "run"
     # Discounted sums that fit into the short episodes, so that there is something to calibrate.
-    launch(path, "collector.total_frames=800", "loss.cost_gamma=0.8", "eval.num_steps=30")
+    tiny.launch(
+        path,
+        "env.num_envs=20",
+        "env.episode_length=50",
+        "collector.frames_per_batch=400",
+        "collector.total_frames=800",
+        "replay_buffer.size=10000",
+        "loss.cost_gamma=0.8",
+        "eval.num_steps=30",
+        "eval.final_episodes=2",
+    )
     return path
 
 
@@ -48,8 +55,8 @@ class TestLoadPolicy:
         manifest = json.loads(next(run_dir.glob("checkpoints/*/manifest.json")).read_text())
         assert "policy" in manifest["components"]
         # The final evaluation was of this policy: the same layouts give the same score.
-        cfg, _ = load_run(run_dir)
-        env = make_env(cfg, cfg.eval.final_episodes, seed=0)
+        options, _ = load_run(run_dir)
+        env = make_env(options, options.eval.final_episodes, seed=0)
         played = evaluate.evaluate(
             env,
             policy,
@@ -62,11 +69,9 @@ class TestLoadPolicy:
 
     def test_two_lines_of_a_script(self, run_dir):
         """As a user writes them, in a process of its own."""
-        load = "from torchrl_safe.trainers.utils import load_policy"
+        load = "from torchrl_safe.trainers import load_policy"
         lines = f"{load}\npolicy = load_policy({str(run_dir)!r})"
-        subprocess.run(
-            [sys.executable, "-c", lines], check=True, cwd=Path(evaluate.__file__).parent
-        )
+        subprocess.run([sys.executable, "-c", lines], check=True)
 
     def test_no_run(self, tmp_path):
         with pytest.raises(FileNotFoundError, match=r"holds no run: it has no config.yaml"):
@@ -132,13 +137,15 @@ def test_watch_without_a_log(tmp_path):
     with pytest.raises(FileNotFoundError, match="no csv log"):
         watch.main(tmp_path, every=1.0, once=True)
     (tmp_path / "log").mkdir()
-    write_config(tmp_path / "config.yaml", OmegaConf.create({"logger": {"backend": "tensorboard"}}))
+    write_config(tmp_path / "config.yaml", tiny.options(tmp_path, "logger.backend=tensorboard"))
     with pytest.raises(FileNotFoundError, match="another logger"):
         watch.main(tmp_path, every=1.0, once=True)
 
 
 def test_drive_from_what_is_not_there(tmp_path, monkeypatch):
-    with pytest.raises(FileNotFoundError, match=r"policy.pt2 is no file: export.py writes one"):
+    with pytest.raises(
+        FileNotFoundError, match=r"policy.pt2 is no file: torchrl-safe export writes one"
+    ):
         run_exported.load(tmp_path / "policy.pt2")
     path = tmp_path / "policy.onnx"
     path.touch()
@@ -161,6 +168,21 @@ def test_export_and_drive(run_dir, onnx, capsys):
     assert goals >= 0
     assert violations >= 0
     assert "20 steps" in capsys.readouterr().out
+
+
+class TestPlay:
+    def test_a_run(self, run_dir, tmp_path, capsys):
+        """The numbers are those of an evaluation on the same layouts; a film is a bonus."""
+        film = tmp_path / "film.mp4"
+        played = play.main(str(run_dir), episodes=2, steps=30, seed=5, out=film)
+        judged = evaluate.main(run_dir, episodes=2, seed=5, film=False)
+        for name in ("return", "cost", "violations", "goals"):
+            assert played[name] == judged[f"det/{name}"]
+        assert film.exists() or "no video" in capsys.readouterr().out
+
+    def test_neither_a_run_nor_a_name(self, tmp_path):
+        with pytest.raises(FileNotFoundError, match=r"a run's folder or one of .*, got 'nobody'"):
+            play.main("nobody")
 
 
 class TestBesideATraining:
@@ -240,13 +262,14 @@ class TestBesideATraining:
             out / "results.json": b"}\n",
             run_dir / "config.yaml": b"\n",
         }
-        cfg = read_config(run_dir / "config.yaml")
+        settings = read_config(run_dir / "config.yaml")
+        options = SimpleNamespace(settings=lambda: settings)
 
         def write():
             evaluate.main(run_dir, episodes=1, seed=5, film=False)
             watch.look(run_dir)
             for _ in range(100):
-                write_config(run_dir / "config.yaml", cfg)
+                write_config(run_dir / "config.yaml", options)
 
         writer = threading.Thread(target=write)
         writer.start()
@@ -254,7 +277,7 @@ class TestBesideATraining:
         while writer.is_alive():
             for path, end in ends.items():
                 assert path.read_bytes().endswith(end), path
-            assert read_config(run_dir / "config.yaml") == cfg
+            assert read_config(run_dir / "config.yaml") == settings
             reads += 1
             time.sleep(0.001)
         writer.join()

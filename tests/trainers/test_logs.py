@@ -6,16 +6,16 @@ import errno
 import time
 
 import pytest
-from omegaconf import OmegaConf
 
 from torchrl_safe.record import read_metrics
 from torchrl_safe.trainers.logs import Log, cut_csv
+from torchrl_safe.trainers.options import Logger
 
 FRAMES = [100, 200, 300, 400]
 
 
 def config(backend):
-    return OmegaConf.create({"logger": {"backend": backend, "project_name": "tests"}})
+    return Logger(backend=backend, project_name="tests")
 
 
 def write(path, frames, backend="csv", after=0):

@@ -15,15 +15,18 @@ from torchrl_safe.trainers import run as runs
 from torchrl_safe.trainers.run import Run, plain, write_results
 
 
+REPOSITORY = Path(__file__).parents[2]
+
+
 def start(path: Path, *overrides: str) -> Run:
-    run = Run(tiny.config(path, *overrides))
+    run = Run(tiny.options(path, *overrides))
     run.start()
     return run
 
 
 def begin(path: Path, *overrides: str) -> None:
     """A run that is killed before its first checkpoint."""
-    with Run(tiny.config(path, *overrides)) as run:
+    with Run(tiny.options(path, *overrides)) as run:
         run.restore()
 
 
@@ -51,7 +54,7 @@ class TestFolder:
 
     @pytest.mark.parametrize("resume", ["resume=true", "resume=false"])
     def test_checkpoints_of_nobody_knows_what(self, tmp_path, resume):
-        with Run(tiny.config(tmp_path)) as run:
+        with Run(tiny.options(tmp_path)) as run:
             run.restore(weight=torch.nn.Linear(1, 1))
             run.save()
         (tmp_path / "config.yaml").unlink()
@@ -72,7 +75,7 @@ class TestFolder:
 
 class TestFinished:
     def finish(self, path: Path, frames: int, results: str) -> None:
-        with Run(tiny.config(path, "collector.total_frames=200")) as run:
+        with Run(tiny.options(path, "collector.total_frames=200")) as run:
             run.restore()
             run.counters["frames"] = frames
             run.save()
@@ -95,7 +98,7 @@ class TestFinished:
         """Results of fewer frames, or torn ones, keep no run from being finished."""
         self.finish(tmp_path, frames, results)
         overrides = ("resume=true", "collector.total_frames=200", *more)
-        with Run(tiny.config(tmp_path, *overrides)) as run:
+        with Run(tiny.options(tmp_path, *overrides)) as run:
             run.restore()
             assert run.frames == frames
             assert run.finished == finished
@@ -128,12 +131,12 @@ def test_as_a_module_and_as_a_sweep(tmp_path):
     arguments += ["collector.total_frames=100", f"run_dir={tmp_path}/runs/${{seed}}"]
     result = subprocess.run(
         [sys.executable, *arguments],
-        cwd=tiny.EXAMPLES.parent,
+        cwd=REPOSITORY,
         capture_output=True,
         text=True,
         check=False,
     )
     assert result.returncode == 0, result.stderr
     assert not list(tmp_path.rglob("multirun.yaml"))
-    assert not (tiny.EXAMPLES.parent / "multirun").exists()
+    assert not (REPOSITORY / "multirun").exists()
     assert sorted(path.name for path in (tmp_path / "runs").iterdir()) == ["0", "1"]

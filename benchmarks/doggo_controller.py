@@ -1,12 +1,12 @@
 """The controller of Doggo's legs: PPO on top of a gait.
 
-    python examples/doggo_controller.py              # find a gait, train, measure, export
-    python examples/doggo_controller.py resume=true  # go on after Ctrl-C
+    python benchmarks/doggo_controller.py              # find a gait, train, measure, export
+    python benchmarks/doggo_controller.py resume=true  # go on after Ctrl-C
 
 The cross-entropy method finds a gait first: torques that swing with a clock. PPO then learns what a
 small network adds to it from what the robot senses, on commands to walk anywhere at any speed, and
 moves the gait itself too. ``legs.safetensors`` in the run's folder is what the robot ``doggo`` is
-shipped with. Every option is in doggo_controller.yaml beside this file; the task is in walking.py.
+shipped with. The task is in walking.py.
 """
 
 from __future__ import annotations
@@ -16,9 +16,8 @@ import time
 from pathlib import Path
 from typing import Any
 
-import hydra
 import torch
-from omegaconf import DictConfig
+from pydantic import Field, field_validator, model_validator
 from safetensors.torch import save_file
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule
@@ -27,17 +26,146 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.modules import MLP, ProbabilisticActor, TanhNormal, ValueOperator
 from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
-from torchrl_safe.trainers.utils import Run, set_up
+from typing_extensions import Self
 from walking import Walking
 
 from torchrl_safe.envs import SafeGoalEnv
 from torchrl_safe.envs.legs import INPUT_SIZE, OTHER_SIDE, SIGNS, STEP
 from torchrl_safe.record import format_table
+from torchrl_safe.trainers import cli
+from torchrl_safe.trainers import options as shared
 from torchrl_safe.trainers.collectors import ResumableCollector
+from torchrl_safe.trainers.options import Group, again, option
+from torchrl_safe.trainers.run import Run
 from torchrl_safe.trainers.streams import stream_seed
 from torchrl_safe.trainers.terminal import GracefulStop, progress_bar, say
+from torchrl_safe.trainers.trainer import set_up
 
 USED = ["observation", "action", "action_log_prob", "advantage", "value_target"]
+
+
+class Env(Group):
+    """Robots."""
+
+    num_envs: int = option(128, "robots", ge=1)
+    episode_length: int = option(1000, "steps of .1 s", ge=1)
+
+
+class Task(Group):
+    """See walking.py."""
+
+    top_speed: float = option(0.6, "m/s that a command of length one asks for", gt=0)
+    tilt_cost: float = option(4.0, "m/s that leaning by a right angle costs", ge=0)
+
+
+class Stage(Group):
+    """Of the cross-entropy method."""
+
+    num_directions: int = option(1, "ways that a gait is tried in", ge=1)
+    population: int = option(192, "gaits that are tried", ge=2)
+    elites: int = option(12, "the best of them", ge=2)
+    num_steps: int = option(30, "that each is tried for", ge=1)
+    generations: int = option(8, "how often", ge=1)
+    std: list[float] = option([0.6, 0.0], "spread at first of what steps ahead and what turns")
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if self.elites > self.population or len(self.std) != 2 or min(self.std) < 0:
+            raise ValueError("no stage")
+        return self
+
+
+STAGES = [
+    Stage(),  # steps ahead
+    Stage(  # and turns
+        num_directions=4, population=64, elites=8, num_steps=40, generations=10, std=[0.1, 0.6]
+    ),
+    Stage(  # and lasts
+        num_directions=8, population=48, elites=8, num_steps=100, generations=14, std=[0.15, 0.15]
+    ),
+]
+
+
+class Policy(Group):
+    """What is added to the gait."""
+
+    num_cells: list[int] = again(shared.Policy, "num_cells", [64, 64])
+    init_std: float = option(0.15, "of the torques' noise, before tanh", gt=0, fixed=True)
+
+
+class Collector(Group):
+    """Who acts, and for how long."""
+
+    frames_per_batch: int = again(shared.Collector, "frames_per_batch", 8192)
+    total_frames: int = option(
+        409_600, "of the whole run after the gait, resumed parts included", ge=1
+    )
+
+
+class Loss(Group):
+    """PPO's."""
+
+    gamma: float = again(shared.Loss, "gamma", 0.97)
+    lmbda: float = option(0.95, "of the advantages' traces", ge=0, le=1)
+    clip_epsilon: float = option(0.2, "of the probability ratio", gt=0, lt=1)
+    entropy_coeff: float = option(0.0, "of the bonus", ge=0)
+
+
+class Optim(Group):
+    """Its optimizer."""
+
+    lr: float = option(5e-4, "at first; it falls linearly to a tenth", gt=0)
+    num_epochs: int = option(5, "passes over each batch", ge=1)
+    minibatch_size: int = option(1024, "frames", ge=1)
+    max_grad_norm: float = option(1.0, "gradients are clipped to it", gt=0)
+
+
+class Eval(Group):
+    """Robots that walk one way each."""
+
+    interval: int = option(81_920, "frames", ge=1)
+    num_directions: int = option(16, "one robot each", ge=1)
+    num_steps: int = option(400, "per direction", ge=1)
+
+
+class Checkpoint(shared.Checkpoint):
+    """Checkpoints."""
+
+    interval: int = again(shared.Checkpoint, "interval", 81_920)
+
+
+class Options(shared.Options):
+    """All of the controller's options."""
+
+    method = "doggo_controller"
+
+    env: Env = Field(default_factory=Env)
+    task: Task = Field(default_factory=Task)
+    gait: list[dict[str, Any]] = option(
+        [stage.model_dump() for stage in STAGES],
+        "the cross-entropy method, in stages",
+        allowed="a list of stages with num_directions, population, elites, num_steps, generations "
+        "(integers of at least 1; 2 to population elites) and std (two numbers of at least 0)",
+        fixed=True,
+    )
+    policy: Policy = Field(default_factory=Policy)
+    critic: shared.Critic = Field(default_factory=shared.Critic)
+    collector: Collector = Field(default_factory=Collector)
+    loss: Loss = Field(default_factory=Loss)
+    optim: Optim = Field(default_factory=Optim)
+    eval: Eval = Field(default_factory=Eval)
+    logger: shared.Logger = Field(default_factory=shared.Logger)
+    checkpoint: Checkpoint = Field(default_factory=Checkpoint)
+
+    @field_validator("gait")
+    @classmethod
+    def _check_gait(cls, value: list[dict[str, Any]]) -> list[dict[str, Any]]:
+        return [Stage(**stage).model_dump() for stage in value]
+
+    @property
+    def folder(self) -> str:
+        """Where the run is."""
+        return self.run_dir or f"runs/doggo_controller/seed_{self.seed}"
 
 
 class Legs(nn.Module):
@@ -82,12 +210,12 @@ def gait_features(observation: torch.Tensor) -> torch.Tensor:
     return ((length[..., None] * ways)[..., None] * clock[..., None, :]).flatten(-2)
 
 
-def make_legs(cfg: DictConfig, gait: torch.Tensor) -> Legs:
+def make_legs(options: Options, gait: torch.Tensor) -> Legs:
     """The gait alone at first: the network's last layer starts at zero."""
-    network = MLP(INPUT_SIZE, 6, num_cells=list(cfg.policy.num_cells), activation_class=nn.Tanh)
+    network = MLP(INPUT_SIZE, 6, num_cells=list(options.policy.num_cells), activation_class=nn.Tanh)
     nn.init.zeros_(network[-1].weight)
     nn.init.zeros_(network[-1].bias)
-    return Legs(gait, network, cfg.policy.init_std)
+    return Legs(gait, network, options.policy.init_std)
 
 
 def make_actor(legs: Legs) -> ProbabilisticActor:
@@ -102,16 +230,16 @@ def make_actor(legs: Legs) -> ProbabilisticActor:
 
 
 def make_env(
-    cfg: DictConfig, num_envs: int, seed: int, num_directions: int | None = None, **options: Any
+    options: Options, num_envs: int, seed: int, num_directions: int | None = None, **kwargs: Any
 ) -> SafeGoalEnv:
     """Doggo by its motors, walking where commands say."""
     return SafeGoalEnv(
         "doggo_torques",
         num_envs=num_envs,
-        num_threads=cfg.num_threads,
+        num_threads=options.num_threads,
         seed=seed,
-        task=Walking(cfg.task.top_speed, cfg.task.tilt_cost, num_directions),
-        **options,
+        task=Walking(options.task.top_speed, options.task.tilt_cost, num_directions),
+        **kwargs,
     )
 
 
@@ -137,7 +265,7 @@ def walk(
     return reward / num_steps, torch.tensor(along) / (num_steps * STEP), fallen
 
 
-def find_gait(cfg: DictConfig) -> torch.Tensor:
+def find_gait(options: Options) -> torch.Tensor:
     """A gait to start from, [6, 6]: the cross-entropy method on the reward, from nothing.
 
     Straight ahead first, then in several directions, which takes turning, under the noise that PPO
@@ -145,10 +273,10 @@ def find_gait(cfg: DictConfig) -> torch.Tensor:
     that of its worst direction; a fall costs a metre per second.
     """
     mean = torch.zeros(6, 6)
-    for stage in cfg.gait:
+    for stage in (Stage(**each) for each in options.gait):
         population, ways = stage.population, stage.num_directions
-        seed = stream_seed("gait", cfg.seed)
-        env = make_env(cfg, population * ways, seed, num_directions=ways)
+        seed = stream_seed("gait", options.seed)
+        env = make_env(options, population * ways, seed, num_directions=ways)
         std = torch.tensor(stage.std).repeat_interleave(3).expand(6, 6)  # of ahead, of turn
         progress = progress_bar(
             total=stage.generations, desc=f"gait, {ways} directions", unit="generation"
@@ -156,7 +284,7 @@ def find_gait(cfg: DictConfig) -> torch.Tensor:
         for _ in range(stage.generations):
             candidates = mean + std * torch.randn(population, 6, 6)
             candidates[0] = mean
-            actor = make_actor(make_legs(cfg, candidates))
+            actor = make_actor(make_legs(options, candidates))
             with set_exploration_type(ExplorationType.RANDOM):
                 reward, speed, fallen = walk(env, actor, stage.num_steps)
             worth = (reward - fallen.float()).view(population, ways)
@@ -174,42 +302,42 @@ def export(legs: Legs, path: Path) -> None:
     tensors = {"gait": legs.gait.detach().clone()}
     for i, layer in enumerate(m for m in legs.network if isinstance(m, nn.Linear)):
         tensors |= {f"weight{i}": layer.weight.detach(), f"bias{i}": layer.bias.detach()}
-    options = [word for word in sys.argv[1:] if not word.startswith(("run_dir", "resume"))]
-    command = " ".join(["python examples/doggo_controller.py", *options])
+    words = [word for word in sys.argv[1:] if not word.startswith(("run_dir", "resume"))]
+    command = " ".join(["python benchmarks/doggo_controller.py", *words])
     save_file(tensors, path, metadata={"command": command})
 
 
 def run_doggo(run: Run) -> None:
     """Find a gait, train, measure and export a controller."""
-    cfg = run.cfg
-    set_up(cfg)
+    options = run.options
+    set_up(options)
     # A checkpoint brings its own gait.
-    legs = make_legs(cfg, find_gait(cfg) if run.begins else torch.zeros(6, 6))
+    legs = make_legs(options, find_gait(options) if run.begins else torch.zeros(6, 6))
     actor = make_actor(legs)
     critic = ValueOperator(
-        MLP(INPUT_SIZE, 1, num_cells=list(cfg.critic.num_cells), activation_class=nn.Tanh),
+        MLP(INPUT_SIZE, 1, num_cells=list(options.critic.num_cells), activation_class=nn.Tanh),
         in_keys=["observation"],
     )
     loss = ClipPPOLoss(
         actor,
         critic,
-        clip_epsilon=cfg.loss.clip_epsilon,
-        entropy_coeff=cfg.loss.entropy_coeff,
+        clip_epsilon=options.loss.clip_epsilon,
+        entropy_coeff=options.loss.entropy_coeff,
         loss_critic_type="l2",
         normalize_advantage=True,
     )
-    advantage = GAE(gamma=cfg.loss.gamma, lmbda=cfg.loss.lmbda, value_network=critic)
-    optim = torch.optim.Adam(loss.parameters(), lr=cfg.optim.lr)
+    advantage = GAE(gamma=options.loss.gamma, lmbda=options.loss.lmbda, value_network=critic)
+    optim = torch.optim.Adam(loss.parameters(), lr=options.optim.lr)
     collector = ResumableCollector(
         make_env(
-            cfg,
-            cfg.env.num_envs,
-            stream_seed("training", cfg.seed, 0),
-            episode_length=cfg.env.episode_length,
+            options,
+            options.env.num_envs,
+            stream_seed("training", options.seed, 0),
+            episode_length=options.env.episode_length,
             stagger=True,
         ),
         actor,
-        frames_per_batch=cfg.collector.frames_per_batch,
+        frames_per_batch=options.collector.frames_per_batch,
         total_frames=-1,  # or it closes its environment, which is to be saved
         exploration_type=ExplorationType.RANDOM,
         auto_register_policy_transforms=False,
@@ -219,29 +347,29 @@ def run_doggo(run: Run) -> None:
     if begins:
         export(legs, run.path / "gait.safetensors")  # to compare with
 
-    total = cfg.collector.total_frames
+    total = options.collector.total_frames
     progress = progress_bar(total=total, initial=run.frames, unit="frame")
-    intervals = (cfg.eval.interval, cfg.checkpoint.interval)
+    intervals = (options.eval.interval, options.checkpoint.interval)
     next_eval, next_save = (run.frames // each * each + each for each in intervals)
     eval_env = make_env(
-        cfg,
-        cfg.eval.num_directions,
+        options,
+        options.eval.num_directions,
         stream_seed("evaluation"),
-        num_directions=cfg.eval.num_directions,
+        num_directions=options.eval.num_directions,
     )
     started = time.perf_counter()
     with GracefulStop() as stop:
         for batch in collector if run.frames_left else ():
             # Steps get smaller towards the end.
             for group in optim.param_groups:
-                group["lr"] = cfg.optim.lr * max(1.0 - run.frames / total, 0.1)
+                group["lr"] = options.optim.lr * max(1.0 - run.frames / total, 0.1)
             run.counters["frames"] += batch.numel()
             run.counters["instabilities"] += int(batch["next", "diverged"].sum())
-            metrics = update(cfg, batch, loss, advantage, optim)
+            metrics = update(options, batch, loss, advantage, optim)
             metrics["train/instabilities"] = run.counters["instabilities"]
             if run.frames >= next_eval:
-                next_eval += cfg.eval.interval
-                metrics |= evaluate(cfg, actor, eval_env)
+                next_eval += options.eval.interval
+                metrics |= evaluate(options, actor, eval_env)
             seconds = time.perf_counter() - started
             started += seconds
             run.counters["seconds"] += seconds
@@ -252,7 +380,7 @@ def run_doggo(run: Run) -> None:
                 reward=f"{metrics['train/reward']:.3f}", tipped=f"{metrics['train/tipped']:.4f}"
             )
             if run.frames >= next_save or stop.requested:
-                next_save += cfg.checkpoint.interval
+                next_save += options.checkpoint.interval
                 run.save()
             if stop.requested or not run.frames_left:
                 break
@@ -264,12 +392,12 @@ def run_doggo(run: Run) -> None:
         say(f"stopped at {run.frames} frames; go on with the same command and resume=true")
         return
     export(legs, run.path / "legs.safetensors")
-    say(format_table(evaluate(cfg, actor, eval_env)))
+    say(format_table(evaluate(options, actor, eval_env)))
     say(f"controller: {run.path / 'legs.safetensors'}")
 
 
 def update(
-    cfg: DictConfig,
+    options: Options,
     batch: TensorDictBase,
     loss: ClipPPOLoss,
     advantage: GAE,
@@ -278,11 +406,11 @@ def update(
     """PPO on a new batch [N, T]: several passes over it in minibatches."""
     with torch.no_grad():
         data = advantage(batch).select(*USED).flatten()
-    for _ in range(cfg.optim.num_epochs):
-        for index in torch.randperm(len(data)).split(cfg.optim.minibatch_size):
+    for _ in range(options.optim.num_epochs):
+        for index in torch.randperm(len(data)).split(options.optim.minibatch_size):
             losses = loss(data[index])
             sum(losses[f"loss_{part}"] for part in ("objective", "critic", "entropy")).backward()
-            nn.utils.clip_grad_norm_(loss.parameters(), cfg.optim.max_grad_norm)
+            nn.utils.clip_grad_norm_(loss.parameters(), options.optim.max_grad_norm)
             optim.step()
             optim.zero_grad()
     following = batch["next"]
@@ -295,10 +423,10 @@ def update(
     }
 
 
-def evaluate(cfg: DictConfig, actor: ProbabilisticActor, env: SafeGoalEnv) -> dict[str, float]:
+def evaluate(options: Options, actor: ProbabilisticActor, env: SafeGoalEnv) -> dict[str, float]:
     """Speed along fixed directions and share of fallen robots, without noise."""
     with set_exploration_type(ExplorationType.DETERMINISTIC):
-        _, speed, fallen = walk(env, actor, cfg.eval.num_steps)
+        _, speed, fallen = walk(env, actor, options.eval.num_steps)
     return {
         "eval/speed": speed.mean().item(),
         "eval/slowest": speed.min().item(),
@@ -306,14 +434,11 @@ def evaluate(cfg: DictConfig, actor: ProbabilisticActor, env: SafeGoalEnv) -> di
     }
 
 
-@hydra.main(
-    config_path="pkg://torchrl_safe.trainers", config_name="doggo_controller", version_base="1.3"
-)
-def main(cfg: DictConfig) -> None:
-    """Doggo's controller as configured in doggo_controller.yaml."""
-    with Run(cfg) as run:
+def main(given: Options) -> None:
+    """Find, train, measure and export, or go on with it."""
+    with Run(given) as run:
         run_doggo(run)
 
 
 if __name__ == "__main__":
-    main()
+    cli.run("doggo_controller", main)

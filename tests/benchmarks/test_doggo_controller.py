@@ -5,7 +5,6 @@ import signal
 from pathlib import Path
 
 import doggo_controller
-import hydra
 import numpy as np
 import pytest
 import torch
@@ -14,8 +13,8 @@ from walking import TIPPED, VERTICAL, Walking
 
 from torchrl_safe.envs import SafeGoalEnv, check_safe_env
 from torchrl_safe.envs.legs import load_legs
+from torchrl_safe.trainers import cli
 
-EXAMPLES = Path(doggo_controller.__file__).parent
 STAGE = "num_directions: 2, population: 4, elites: 2, num_steps: 4, generations: 2"
 TINY = [
     "num_threads=1",
@@ -32,9 +31,8 @@ TINY = [
 
 
 def launch(run_dir: Path, *overrides: str) -> None:
-    with hydra.initialize_config_dir(str(EXAMPLES), version_base="1.3"):
-        cfg = hydra.compose("doggo_controller", [f"run_dir={run_dir}", *TINY, *overrides])
-    doggo_controller.main.__wrapped__(cfg)
+    words = [f"run_dir={run_dir}", *TINY, *overrides]
+    doggo_controller.main(cli.compose("doggo_controller", words))
 
 
 def test_an_interrupted_run_ends_as_one_that_was_not(tmp_path, monkeypatch, capsys):

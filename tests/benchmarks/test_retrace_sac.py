@@ -1,13 +1,11 @@
 from __future__ import annotations
 
 import csv
-from pathlib import Path
 
-import hydra
 import pytest
 import retrace_sac
 
-EXAMPLES = Path(retrace_sac.__file__).parent
+from torchrl_safe.trainers import cli
 
 
 @pytest.mark.parametrize("estimator", ["retrace", "td0"])
@@ -23,9 +21,7 @@ def test_writes_a_learning_curve(tmp_path, estimator):
         "eval.interval=300",
         "eval.num_episodes=1",
     ]
-    with hydra.initialize_config_dir(str(EXAMPLES), version_base="1.3"):
-        cfg = hydra.compose("retrace_sac", overrides)
-    retrace_sac.main.__wrapped__(cfg)
+    retrace_sac.main(cli.compose("retrace_sac", overrides))
     with open(tmp_path / "curves.csv") as file:
         rows = list(csv.DictReader(file))
     assert [int(row["frames"]) for row in rows] == [100, 200, 300]

@@ -28,7 +28,9 @@ def load(path: Path) -> Controller:
     """The file as a function of arrays."""
     path = expand(path)
     if not path.is_file():
-        raise FileNotFoundError(f"{printable(path)} is no file: torchrl-safe export writes one from a run.")
+        raise FileNotFoundError(
+            f"{printable(path)} is no file: torchrl-safe export writes one from a run."
+        )
     if path.suffix == ".onnx":
         if find_spec("onnxruntime") is None:
             raise ModuleNotFoundError(

@@ -14,7 +14,6 @@ import torch
 from torchrl_safe.trainers import run as runs
 from torchrl_safe.trainers.run import Run, plain, write_results
 
-
 REPOSITORY = Path(__file__).parents[2]
 
 

@@ -87,7 +87,7 @@ def make_collector(
 def envs_per_batch(settings: Mapping[str, Any]) -> int:
     """How many environments a batch of :func:`make_collector` is of, by a run's settings."""
     collector = settings["collector"]
-    shared = collector["backend"] == "multi_async"
+    shared = collector.get("backend") == "multi_async"
     return settings["env"]["num_envs"] // (collector["num_workers"] if shared else 1)
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import Any
 
-__all__ = ["cost_key", "names_among", "violation_key"]
+__all__ = ["cost_key", "costs_among", "prefix_of", "violation_key"]
 
 
 def cost_key(name: str) -> str:
@@ -22,22 +22,32 @@ def cost_key(name: str) -> str:
     return f"{name}_cost" if name else "cost"
 
 
-def violation_key(name: str) -> str:
+def prefix_of(cost: str) -> str:
+    """What stands before every entry that belongs to a cost.
+
+    Examples:
+        >>> prefix_of("speed_cost"), prefix_of("cost")
+        ('speed_', '')
+    """
+    return cost.removesuffix("cost")
+
+
+def violation_key(cost: str) -> str:
     """The entry that says whether a cost's constraint is violated.
 
     Examples:
-        >>> violation_key("speed"), violation_key("")
+        >>> violation_key("speed_cost"), violation_key("cost")
         ('speed_violation', 'violation')
     """
-    return f"{name}_violation" if name else "violation"
+    return f"{prefix_of(cost)}violation"
 
 
-def names_among(keys: Iterable[Any]) -> tuple[str, ...]:
-    """The names of several costs among entries; none where there is one, or no cost.
+def costs_among(keys: Iterable[Any]) -> tuple[str, ...]:
+    """The costs among entries.
 
     Examples:
-        >>> names_among(["reward", "cost"]), names_among(["collision_cost", "speed_cost", "reward"])
-        ((), ('collision', 'speed'))
+        >>> costs_among(["reward", "cost"]), costs_among(["collision_cost", "speed_cost", "reward"])
+        (('cost',), ('collision_cost', 'speed_cost'))
     """
     strings = [key for key in keys if isinstance(key, str)]
-    return tuple(key.removesuffix("_cost") for key in strings if key.endswith("_cost"))
+    return tuple(key for key in strings if key == "cost" or key.endswith("_cost"))

@@ -22,7 +22,7 @@ from torchrl_safe.envs import (
     SafeFrameSkip,
     SafeRobotEnv,
     check_safe_env,
-    cost_names,
+    cost_keys,
 )
 
 
@@ -100,16 +100,16 @@ def test_is_the_function_of_the_steps_of_gymnasium():
 
 def test_several_costs():
     env = pendulum(both, violation_above={"speed": 0.0, "torque": 1.0})
-    assert cost_names(env) == ("speed", "torque")
+    assert cost_keys(env) == ("speed_cost", "torque_cost")
     check_safe_env(env)
     step = env.rollout(50)["next"]
     assert (step["torque_violation"] == (step["torque_cost"] > 1.0)).all()
-    assert cost_names(serial()) == ()
+    assert cost_keys(serial()) == ("cost",)
     columns = pendulum(
         lambda step: torch.stack([both(step)[k].reshape(step.batch_size) for k in both(step)], -1),
         names=["speed", "torque"],
     )
-    assert cost_names(columns) == ("speed", "torque")
+    assert cost_keys(columns) == ("speed_cost", "torque_cost")
     check_safe_env(columns)
 
 

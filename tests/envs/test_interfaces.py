@@ -220,15 +220,16 @@ class TestOldNames:
     )
     def test_module(self, module, name, new):
         old = importlib.import_module(f"torchrl_safe.envs.{module}")
-        with pytest.warns(DeprecationWarning, match=f"envs.{module}.{name} is deprecated: use "):
+        with pytest.warns(DeprecationWarning, match=f"envs.{module}.{name} is deprecated: it is "):
             assert getattr(old, name) is new
 
     def test_from_the_package(self):
-        with pytest.warns(DeprecationWarning, match="use torchrl_safe.envs.GymRobotVectorEnv"):
+        with pytest.warns(DeprecationWarning, match=r"it is .*\.GymRobotVectorEnv now"):
             assert envs.GymGoalVectorEnv is GymRobotVectorEnv
-        with pytest.warns(DeprecationWarning, match="use torchrl_safe.envs.interfaces.suite"):
-            from torchrl_safe.envs import suite as old
-        assert old is suite
+        from torchrl_safe.envs import suite as old
+
+        with pytest.warns(DeprecationWarning, match=r"it is .*\.interfaces\.suite\.load now"):
+            assert old.load is suite.load
 
     def test_safe_goal_env_is_the_same_class(self):
         assert envs.SafeGoalEnv is SafeRobotEnv

@@ -15,7 +15,7 @@ from torchrl_safe.envs import (
     SafeFrameSkip,
     SafeRobotEnv,
     check_safe_env,
-    cost_names,
+    cost_keys,
 )
 from torchrl_safe.envs.interfaces import suite
 
@@ -61,7 +61,7 @@ def test_keeps_the_contract():
         SafeRobotEnv("jackal", task="navigation_speed", num_envs=3, num_threads=n, episode_length=9)
         for n in (1, 2)
     )
-    assert cost_names(env) == ("collision", "speed")
+    assert cost_keys(env) == ("collision_cost", "speed_cost")
     check_safe_env(env, twins=[twin], time_limit=9)
 
 

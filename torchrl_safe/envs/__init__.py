@@ -8,10 +8,10 @@ dm_control.
 
 from __future__ import annotations
 
-from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from torchrl_safe.envs._moved import MODULES, NAMES, keep_old_paths, warn_moved
+from torchrl_safe._deprecation import moved
+from torchrl_safe.envs._moved import keep_old_paths
 from torchrl_safe.envs.adapters import CostToReward, cost_from_info
 from torchrl_safe.envs.checks import check_safe_env
 from torchrl_safe.envs.interfaces.registration import register_envs
@@ -24,7 +24,7 @@ from torchrl_safe.envs.randomization import (
 from torchrl_safe.envs.robots import ROBOTS, Robot, get_robot
 from torchrl_safe.envs.tasks import GoalTask, NavigationSpeedTask, NavigationTask
 from torchrl_safe.envs.tasks.velocity import VELOCITY_TASKS, VelocityTask, get_velocity_task
-from torchrl_safe.envs.transforms import CostFunction, SafeFrameSkip, cost_names
+from torchrl_safe.envs.transforms import CostFunction, SafeFrameSkip, cost_keys
 
 if TYPE_CHECKING:
     from torchrl_safe.envs.interfaces.gymnasium import (
@@ -60,21 +60,24 @@ __all__ = [
     "VelocityTask",
     "check_safe_env",
     "cost_from_info",
-    "cost_names",
+    "cost_keys",
     "get_robot",
     "get_velocity_task",
 ]
 
 
+_renamed = moved(
+    __name__,
+    {
+        "GymGoalEnv": f"{__name__}.GymRobotEnv",
+        "GymGoalVectorEnv": f"{__name__}.GymRobotVectorEnv",
+    },
+)
+
+
 def __getattr__(name: str) -> Any:
-    if name in MODULES:
-        warn_moved(f"{__name__}.{name}", MODULES[name])
-        return import_module(MODULES[name])
-    if name in NAMES:
-        warn_moved(f"{__name__}.{name}", f"{__name__}.{NAMES[name]}")
-        name = NAMES[name]
     if name not in __all__:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        return _renamed(name)
     from torchrl_safe.envs import robot_env, velocity_env
     from torchrl_safe.envs.interfaces import gymnasium
 
@@ -87,4 +90,4 @@ def __dir__() -> list[str]:
 
 
 register_envs()
-keep_old_paths(__name__)
+keep_old_paths()

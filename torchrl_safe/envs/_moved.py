@@ -2,44 +2,31 @@
 
 from __future__ import annotations
 
-import importlib
 import sys
-import warnings
 from types import ModuleType
-from typing import Any
 
-_GYMNASIUM = "torchrl_safe.envs.interfaces.gymnasium"
+from torchrl_safe._deprecation import moved
 
-MODULES = {
-    "goal": "torchrl_safe.envs.robot_env",
-    "velocity": "torchrl_safe.envs.velocity_env",
-    "gymnasium": _GYMNASIUM,
-    "velocity_gymnasium": _GYMNASIUM,
-    "registration": "torchrl_safe.envs.interfaces.registration",
-    "suite": "torchrl_safe.envs.interfaces.suite",
+_ENVS, _INTERFACES = "torchrl_safe.envs", "torchrl_safe.envs.interfaces"
+
+_NAMES = {
+    "goal": {"SafeGoalEnv": f"{_ENVS}.SafeGoalEnv"},
+    "velocity": {"SafeVelocityEnv": f"{_ENVS}.SafeVelocityEnv"},
+    "gymnasium": {
+        "GymGoalEnv": f"{_ENVS}.GymRobotEnv",
+        "GymGoalVectorEnv": f"{_ENVS}.GymRobotVectorEnv",
+    },
+    "velocity_gymnasium": {
+        name: f"{_ENVS}.{name}" for name in ("GymVelocityEnv", "GymVelocityVectorEnv")
+    },
+    "registration": {"register_envs": f"{_INTERFACES}.registration.register_envs"},
+    "suite": {name: f"{_INTERFACES}.suite.{name}" for name in ("Physics", "SafeTask", "load")},
 }
-"""Modules of ``torchrl_safe.envs`` that moved, and where they are."""
-
-NAMES = {"GymGoalEnv": "GymRobotEnv", "GymGoalVectorEnv": "GymRobotVectorEnv"}
-"""Classes that have another name."""
 
 
-class _Moved(ModuleType):
-    def __getattr__(self, name: str) -> Any:
-        if name.startswith("__"):  # what Python and its tools look for
-            raise AttributeError(name)
-        home = MODULES[self.__name__.rpartition(".")[2]]
-        value = getattr(importlib.import_module(home), NAMES.get(name, name))
-        warn_moved(f"{self.__name__}.{name}", f"{home}.{NAMES.get(name, name)}")
-        return value
-
-
-def warn_moved(old: str, new: str) -> None:
-    """Says once a place that a name is another one now."""
-    warnings.warn(f"{old} is deprecated: use {new}.", DeprecationWarning, stacklevel=3)
-
-
-def keep_old_paths(package: str) -> None:
+def keep_old_paths() -> None:
     """Lets ``from torchrl_safe.envs.goal import SafeGoalEnv`` and the like work."""
-    for name in MODULES:
-        sys.modules.setdefault(f"{package}.{name}", _Moved(f"{package}.{name}"))
+    for name, names in _NAMES.items():
+        old = ModuleType(f"{_ENVS}.{name}", "Moved: see the warnings.")
+        old.__getattr__ = moved(old.__name__, names)  # type: ignore[method-assign]
+        sys.modules.setdefault(old.__name__, old)

@@ -203,23 +203,26 @@ def cost_from_info(
         names = sorted(sources) if several else "one number"
         raise ValueError(f"violation_above must be for {names}, got {sorted(bounds)}.")
     taken = {*env.full_observation_spec.keys(), *env.full_reward_spec.keys()}
-    clashes = sorted(taken & {key(name) for name in sources for key in (cost_key, violation_key)})
+    costs = {name: cost_key(name) for name in sources}
+    clashes = sorted(taken & {*costs.values(), *map(violation_key, costs.values())})
     if clashes:
         raise ValueError(
             f"the environment has entries {clashes} of its own: name the costs otherwise, "
             "cost={name: ...}."
         )
     env.set_info_dict_reader(
-        _CostReader({cost_key(name): source for name, source in sources.items()}, env.batch_size)
+        _CostReader({costs[name]: source for name, source in sources.items()}, env.batch_size)
     )
     return TransformedEnv(
         env,
         Compose(
             *(
                 CostToReward(
-                    cost_key(name), violation_key=violation_key(name), violation_above=bounds[name]
+                    key,
+                    violation_key=violation_key(key),
+                    violation_above=bounds[name],
                 )
-                for name in sources
+                for name, key in costs.items()
             )
         ),
     )

@@ -15,8 +15,8 @@ from torchrl.data import Composite
 from torchrl.envs import EnvBase, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
-from torchrl_safe import _costs as naming
-from torchrl_safe.envs.transforms import cost_names
+from torchrl_safe._costs import violation_key as flag_of
+from torchrl_safe.envs.transforms import cost_keys
 
 __all__ = ["check_safe_env"]
 
@@ -83,14 +83,12 @@ def check_safe_env(
     with _quiet(), torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         check_env_specs(env, seed=seed)
-        names = cost_names(env) if cost_key is None else ()
-        if names:
-            flags = names if violation_key is not None else ()
-            costs = [naming.cost_key(name) for name in names]
-            violations: list[NestedKey] = [naming.violation_key(name) for name in flags]
-        else:
-            costs = ["cost" if cost_key is None else cost_key]
-            violations = [] if violation_key is None else [violation_key]
+        costs: list[NestedKey] = [*cost_keys(env)] if cost_key is None else [cost_key]
+        violations: list[NestedKey] = []
+        if cost_key is None and violation_key == "violation":
+            violations += [flag_of(cost) for cost in cost_keys(env)]
+        elif violation_key is not None:
+            violations.append(violation_key)
         _check_promises(env, twins, time_limit, num_steps, seed, costs, violations)
 
 
@@ -104,6 +102,8 @@ def _check_promises(
     violations: list[NestedKey],
 ) -> None:
     shape = torch.Size((*env.batch_size, 1))
+    leaves = list(env.full_reward_spec.keys(True, True))
+    _promise(costs, f"'cost' must be among {leaves}.")
     for cost in costs:
         _check_leaf(env.full_reward_spec, cost, shape, torch.float32)
     _promise(
@@ -136,7 +136,7 @@ def _check_promises(
     env.reset()
 
 
-def _promise(kept: bool | torch.Tensor, message: str) -> None:
+def _promise(kept: bool | torch.Tensor | list[NestedKey], message: str) -> None:
     """An assertion that ``python -O`` keeps."""
     if not kept:
         raise AssertionError(message)

@@ -12,30 +12,28 @@ from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase, FrameSkipTransform, Transform
 from torchrl.envs.utils import step_mdp
 
-from torchrl_safe._costs import cost_key, names_among, violation_key
+from torchrl_safe._costs import cost_key, costs_among, violation_key
 from torchrl_safe.envs.adapters import reject_skipped_frames
 
-__all__ = ["CostFunction", "SafeFrameSkip", "cost_names"]
+__all__ = ["CostFunction", "SafeFrameSkip", "cost_keys"]
 
 
-def cost_names(env: EnvBase) -> tuple[str, ...]:
-    """The names of an environment's costs, in the order of its reward spec.
-
-    An environment with one cost writes it as ``("next", "cost")``. One with several writes each as
-    ``("next", "<name>_cost")``, and ``"<name>_violation"`` among the observations.
+def cost_keys(env: EnvBase) -> tuple[str, ...]:
+    """Where an environment writes its costs, in the order of its reward spec.
 
     Args:
         env (EnvBase): the environment, with or without transforms.
 
     Returns:
-        tuple of str: the names of several costs; empty where there is one.
+        tuple of str: ``("cost",)``; of several costs, ``"<name>_cost"`` each. Beside it, the
+        observation ``"<name>_violation"`` says whether the step violated.
 
     Examples:
         >>> from torchrl_safe.envs import SafeRobotEnv
-        >>> cost_names(SafeRobotEnv("jackal", task="navigation_speed", num_envs=2, num_threads=1))
-        ('collision', 'speed')
+        >>> cost_keys(SafeRobotEnv("jackal", task="navigation_speed", num_envs=2, num_threads=1))
+        ('collision_cost', 'speed_cost')
     """
-    return names_among(env.full_reward_spec.keys(True, True))
+    return costs_among(env.full_reward_spec.keys(True, True))
 
 
 class CostFunction(Transform):
@@ -83,8 +81,8 @@ class CostFunction(Transform):
         >>> def costs(step):
         ...     return {"speed": speed(step), "torque": step["action"].square().sum(-1)}
         >>> env = TransformedEnv(GymEnv("Pendulum-v1"), CostFunction(costs))
-        >>> cost_names(env)
-        ('speed', 'torque')
+        >>> cost_keys(env)
+        ('speed_cost', 'torque_cost')
     """
 
     def __init__(
@@ -177,7 +175,7 @@ class CostFunction(Transform):
                     f"it is not{where}: {cost}."
                 )
             next_tensordict.set(cost_key(name), cost)
-            next_tensordict.set(violation_key(name), cost > self._bound(name))
+            next_tensordict.set(violation_key(cost_key(name)), cost > self._bound(name))
         return next_tensordict
 
     def _reset(
@@ -186,7 +184,7 @@ class CostFunction(Transform):
         shape = (*tensordict_reset.batch_size, 1)
         for name in self._found:
             no = torch.zeros(shape, dtype=torch.bool, device=tensordict_reset.device)
-            tensordict_reset.set(violation_key(name), no)
+            tensordict_reset.set(violation_key(cost_key(name)), no)
         return tensordict_reset
 
     def _bound(self, name: str) -> float:
@@ -202,7 +200,7 @@ class CostFunction(Transform):
         shape, device = (*output_spec.shape, 1), observations.device
         taken = {*observations.keys(True, True), *rewards.keys(True, True)}
         for name in self._found:
-            clashes = sorted(map(str, taken & {cost_key(name), violation_key(name)}))
+            clashes = sorted(map(str, taken & {cost_key(name), violation_key(cost_key(name))}))
             if clashes:
                 raise ValueError(
                     f"the environment has entries {clashes} of its own: name the cost otherwise, "
@@ -210,7 +208,7 @@ class CostFunction(Transform):
                 )
             rewards[cost_key(name)] = Unbounded(shape, device=device, dtype=torch.float32)
             flag = Binary(1, shape=shape, dtype=torch.bool, device=device)
-            observations[violation_key(name)] = flag
+            observations[violation_key(cost_key(name))] = flag
         return output_spec
 
 

@@ -22,7 +22,7 @@ from torchrl_safe.objectives.value import (
     retrace_variance_reward,
     squared_td_error,
 )
-from torchrl_safe.objectives.value.utils import get_entry, repair_next
+from torchrl_safe.objectives.value.utils import get_entry, next_key, repair_next
 
 
 class CostMoments(NamedTuple):
@@ -104,7 +104,7 @@ class _SurrogateLoss(TrajectoryLoss):
         """A critic's prediction of the next state, [*B, 1]."""
         in_keys = getattr(self, name).in_keys
         for in_key in in_keys:
-            get_entry(tensordict, ("next", in_key), f"an input of {name} at the next state")
+            get_entry(tensordict, next_key(in_key), f"an input of {name} at the next state")
         return self._value(name, key, repair_next(tensordict, in_keys).get("next"))
 
     def _values(

@@ -30,7 +30,7 @@ from torchrl_safe.objectives.functional import (
 )
 from torchrl_safe.objectives.utils import as_given, ensemble, make_estimator
 from torchrl_safe.objectives.value import PolicyEvaluation, RetraceEstimator
-from torchrl_safe.objectives.value.utils import get_entry, repair_next
+from torchrl_safe.objectives.value.utils import get_entry, repair_next, with_action
 
 
 class TsallisLoss(SACLoss):
@@ -539,9 +539,6 @@ class TsallisLoss(SACLoss):
         params: TensorDictBase,
     ) -> Tensor:
         keys = self.tensor_keys
-        inputs = tensordict.select(*self.qvalue_network.in_keys, strict=False)
-        inputs.set(keys.action, action)
-        for key in self.qvalue_network.in_keys:
-            get_entry(inputs, key, "an input of qvalue_network")
+        inputs = with_action(tensordict, keys.action, action, self.qvalue_network)
         values = self._vmap_qnetworkN0(inputs, params, keys.state_action_value)
         return values.squeeze(-1).min(0)[0]

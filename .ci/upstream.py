@@ -81,6 +81,7 @@ def main(root: Path) -> None:
     text = insert(text, "import torch", "").replace(
         "import torch\n", "import torch\nfrom torch import Tensor\n", 1
     )
+    text += definitions("torchrl_safe/_checks.py", {"check_count", "check_number"})
     files[value / "functional.py"] = text + definitions(
         "torchrl_safe/objectives/value/functional.py", SAFETAC_ONLY
     )

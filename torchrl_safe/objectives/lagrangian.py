@@ -12,7 +12,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
-from torchrl_safe.objectives.functional import check_count, check_number
+from torchrl_safe._checks import check_count, check_number
 
 __all__ = ["LagrangeMultiplier", "PIDMultiplier", "lagrangian"]
 

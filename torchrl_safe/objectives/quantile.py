@@ -20,6 +20,7 @@ from torchrl.objectives.value import (
     ValueEstimatorBase,
 )
 
+from torchrl_safe._checks import check_count, check_number
 from torchrl_safe.objectives.common import CriticCostLoss, Steps
 from torchrl_safe.objectives.distribution import (
     cvar_distortion,
@@ -29,7 +30,7 @@ from torchrl_safe.objectives.distribution import (
     spectral_risk,
     spectral_weights,
 )
-from torchrl_safe.objectives.functional import check_count, check_number, check_regression
+from torchrl_safe.objectives.functional import check_regression
 from torchrl_safe.objectives.value import (
     PolicyEvaluation,
     RetraceEstimator,

@@ -21,9 +21,9 @@ from torchrl.modules.distributions.utils import rsample_and_log_prob, sample_and
 from torchrl.objectives import SACLoss, ValueEstimators, distance_loss
 from torchrl.objectives.value import ValueEstimatorBase
 
+from torchrl_safe._checks import check_number
 from torchrl_safe.objectives.functional import (
     check_entropic_index,
-    check_number,
     check_regression,
     q_logarithm,
     uniform_tsallis_entropy,

@@ -116,7 +116,8 @@ def main(root: Path) -> None:
     )
     ours = ("utils", "advantages")
     files[value / "advantages.py"] = text + "".join(
-        upstream(definitions(f"torchrl_safe/objectives/value/{name}.py")) for name in ours
+        upstream(definitions(f"torchrl_safe/objectives/value/{name}.py", {"with_action"}))
+        for name in ours
     )
 
     text = (value / "__init__.py").read_text()

@@ -10,7 +10,9 @@ from typing import Any
 from torch import Tensor
 
 
-def check_shape(name: str, tensor: Tensor, expected: Sequence[int], origin: str) -> None:
+def check_shape(
+    name: str, tensor: Tensor, expected: Sequence[int], origin: str, *, hint: str = ""
+) -> None:
     """Raise a ``ValueError`` unless a tensor has the shape that something else asks for.
 
     Args:
@@ -18,6 +20,9 @@ def check_shape(name: str, tensor: Tensor, expected: Sequence[int], origin: str)
         tensor (Tensor): what it was given.
         expected (sequence of int): the shape.
         origin (str): what asks for it, such as ``"that of reward"``.
+
+    Keyword Args:
+        hint (str): how to come by such a tensor, for the message.
 
     Examples:
         >>> import torch
@@ -28,7 +33,8 @@ def check_shape(name: str, tensor: Tensor, expected: Sequence[int], origin: str)
     """
     if tensor.shape != tuple(expected):
         raise ValueError(
-            f"{name} must have shape {tuple(expected)}, {origin}, got {tuple(tensor.shape)}."
+            f"{name} must have shape {tuple(expected)}, {origin}, got {tuple(tensor.shape)}"
+            f"{hint and ': '}{hint}."
         )
 
 

@@ -15,6 +15,7 @@ from torchrl.objectives import distance_loss
 from torchrl.objectives.utils import ValueEstimators
 from torchrl.objectives.value import ValueEstimatorBase
 
+from torchrl_safe._checks import check_shape
 from torchrl_safe.objectives.common import CriticCostLoss
 from torchrl_safe.objectives.functional import check_regression, gaussian_cvar
 from torchrl_safe.objectives.value import (
@@ -399,12 +400,8 @@ class CVaRCostLoss(CriticCostLoss):
             )
         shape = (*prediction.shape, 1)
         for key, target in given.items():
-            if target.shape != shape:
-                raise ValueError(
-                    f"{key!r} must have shape {shape}, that of the critics' output, got "
-                    f"{tuple(target.shape)}: compute_target returns it, or set_keys names another "
-                    "entry."
-                )
+            hint = "compute_target returns it, or set_keys names another entry"
+            check_shape(repr(key), target, shape, "that of the critics' output", hint=hint)
         return given[keys[0]].squeeze(-1), given[keys[1]].squeeze(-1)
 
     def _predict_next(

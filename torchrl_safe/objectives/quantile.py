@@ -20,7 +20,7 @@ from torchrl.objectives.value import (
     ValueEstimatorBase,
 )
 
-from torchrl_safe._checks import check_count, check_number
+from torchrl_safe._checks import check_count, check_number, check_shape
 from torchrl_safe.objectives.common import CriticCostLoss, Steps
 from torchrl_safe.objectives.distribution import (
     cvar_distortion,
@@ -433,11 +433,8 @@ class QuantileCostLoss(CriticCostLoss):
                 f"[{', '.join(map(str, quantiles.shape[:-1]))}, M], got {tuple(samples.shape)}: "
                 "compute_target returns them, or set_keys names another entry."
             )
-        if weights.shape != samples.shape:
-            raise ValueError(
-                f"{keys.target_weight!r} must have shape {tuple(samples.shape)}, that of "
-                f"{keys.cost_target!r}, got {tuple(weights.shape)}."
-            )
+        origin = f"that of {keys.cost_target!r}"
+        check_shape(repr(keys.target_weight), weights, samples.shape, origin)
         return samples, weights
 
     def _sums(

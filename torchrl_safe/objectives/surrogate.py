@@ -15,6 +15,7 @@ from torchrl.objectives import distance_loss
 from torchrl.objectives.utils import ValueEstimators
 from torchrl.objectives.value import ValueEstimatorBase
 
+from torchrl_safe._checks import check_shape
 from torchrl_safe.objectives.common import CostLoss, Steps, TrajectoryLoss, spread
 from torchrl_safe.objectives.functional import check_regression, gaussian_cvar, surrogate_change
 from torchrl_safe.objectives.value import (
@@ -188,12 +189,8 @@ class _SurrogateLoss(TrajectoryLoss):
 
     def _regression(self, prediction: Tensor, key: NestedKey, tensordict: TensorDictBase) -> Tensor:
         target = self._computed(tensordict, key)
-        if target.shape != prediction.shape:
-            raise ValueError(
-                f"{key!r} must have shape {tuple(prediction.shape)}, that of the critic's output, "
-                f"got {tuple(target.shape)}: compute_advantage writes it, or set_keys names "
-                "another entry."
-            )
+        hint = "compute_advantage writes it, or set_keys names another entry"
+        check_shape(repr(key), target, prediction.shape, "that of the critic's output", hint=hint)
         loss = distance_loss(prediction, target, self.loss_function).squeeze(-1)
         return self._reduce_loss(loss, tensordict=tensordict, weights=None)
 

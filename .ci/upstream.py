@@ -81,6 +81,7 @@ def main(root: Path) -> None:
     text = insert(text, "import torch", "").replace(
         "import torch\n", "import torch\nfrom torch import Tensor\n", 1
     )
+    text += definitions("torchrl_safe/_checks.py", {"check_count", "check_number"})
     files[value / "functional.py"] = text + definitions(
         "torchrl_safe/objectives/value/functional.py", SAFETAC_ONLY
     )
@@ -115,7 +116,8 @@ def main(root: Path) -> None:
     )
     ours = ("utils", "advantages")
     files[value / "advantages.py"] = text + "".join(
-        upstream(definitions(f"torchrl_safe/objectives/value/{name}.py")) for name in ours
+        upstream(definitions(f"torchrl_safe/objectives/value/{name}.py", {"with_action"}))
+        for name in ours
     )
 
     text = (value / "__init__.py").read_text()

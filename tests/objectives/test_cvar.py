@@ -6,6 +6,7 @@ from functools import partial
 
 import pytest
 import torch
+from cost_losses import ACT, OBS, make_actor, make_data
 from tensordict import TensorDict
 from tensordict.nn import CompositeDistribution, NormalParamExtractor, TensorDictModule
 from torch import nn
@@ -14,22 +15,13 @@ from torchrl.modules import MLP, ProbabilisticActor, TanhNormal, ValueOperator
 from torchrl.objectives import SoftUpdate, ValueEstimators
 from torchrl.objectives.value import TD0Estimator
 
-from torchrl_safe import CVaRCostLoss, GMMTanhPolicy, RetraceEstimator
+from torchrl_safe import CVaRCostLoss, RetraceEstimator
 from torchrl_safe.objectives.functional import (
     cvar_factor,
     discounted_cost_limit,
     gaussian_cvar,
 )
 from torchrl_safe.objectives.value import PolicyEvaluation, evaluate_policy
-
-OBS, ACT = 3, 2
-
-
-def make_actor():
-    net = MLP(OBS, 3 * (1 + 2 * ACT), num_cells=[16])
-    return GMMTanhPolicy(
-        net, Bounded(-1, 1, (ACT,), dtype=torch.float64), num_components=3
-    ).double()
 
 
 def make_critic(key, *last):
@@ -48,30 +40,6 @@ def make_loss(cost_limit=2.5, gamma=0.9, lmbda=0.8, **kwargs):
     )
     loss.make_value_estimator(gamma=gamma, lmbda=lmbda)
     return loss
-
-
-def make_data(batch=(4, 6)):
-    generator = torch.Generator().manual_seed(3)
-
-    def rand(*shape):
-        return torch.randn(*batch, *shape, generator=generator, dtype=torch.float64)
-
-    done = torch.rand(*batch, 1, generator=generator) < 0.2
-    terminated = done & (torch.rand(*batch, 1, generator=generator) < 0.5)
-    return TensorDict(
-        {
-            "observation": rand(OBS),
-            "action": rand(ACT).tanh(),
-            "action_log_prob": rand(),
-            "next": {
-                "observation": rand(OBS),
-                "cost": rand(1).sigmoid(),
-                "done": done,
-                "terminated": terminated,
-            },
-        },
-        batch_size=batch,
-    )
 
 
 def predictions(loss, data, action):

@@ -89,7 +89,7 @@ class TestQuantileLoss:
     def test_bad_shapes(self):
         with pytest.raises(ValueError, match=r"samples must have the batch .* got \(3, 5\)"):
             quantile_loss(rand(2, 4), rand(3, 5))
-        with pytest.raises(ValueError, match=r"weights must have the shape of samples, \(2, 5\)"):
+        with pytest.raises(ValueError, match=r"weights must have shape \(2, 5\), that of samples"):
             quantile_loss(rand(2, 4), rand(2, 5), rand(2, 4))
 
 
@@ -265,7 +265,7 @@ class TestProjection:
             assert quantile_loss(other, samples, weights) >= loss
 
     def test_bad_shapes(self):
-        with pytest.raises(ValueError, match="weights must have the shape of samples"):
+        with pytest.raises(ValueError, match=r"weights must have shape \(2, 4\), that of samples"):
             project_to_quantiles(rand(2, 4), 3, rand(4))
 
 

@@ -185,10 +185,12 @@ class TestSurrogateChange:
 
     def test_misuse(self):
         x = torch.zeros(3)
-        for position in range(4):
+        for position, name in enumerate(("log_pi", "log_pi", "log_mu", "advantage")):
             args = [x] * 4
             args[position] = x[:2]
-            with pytest.raises(ValueError, match=r"must have the same shape, got .*\(2,\)"):
+            with pytest.raises(
+                ValueError, match=rf"{name} must have shape \([23],\), that of log_"
+            ):
                 surrogate_change(*args, 0.9)
         for gamma in (-0.1, 1.0, math.nan):
             with pytest.raises(ValueError, match=rf"gamma must be in \[0, 1\), got {gamma}"):

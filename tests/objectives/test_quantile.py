@@ -6,14 +6,14 @@ from copy import deepcopy
 import numpy as np
 import pytest
 import torch
+from cost_losses import ACT, OBS, make_actor, make_data
 from tensordict import TensorDict
 from torch import nn
-from torchrl.data import Bounded
 from torchrl.modules import MLP, ValueOperator
 from torchrl.objectives import SoftUpdate, ValueEstimators
 from torchrl.objectives.value import GAE, TDLambdaEstimator
 
-from torchrl_safe import CVaRCostLoss, GMMTanhPolicy, RetraceEstimator
+from torchrl_safe import CVaRCostLoss, RetraceEstimator
 from torchrl_safe.objectives import MeasuredCVaR, QuantileCostLoss
 from torchrl_safe.objectives.distribution import (
     quantile_cvar,
@@ -28,14 +28,7 @@ from torchrl_safe.objectives.value import (
     visited_value_estimate,
 )
 
-OBS, ACT, N = 3, 2, 8
-
-
-def make_actor():
-    net = MLP(OBS, 3 * (1 + 2 * ACT), num_cells=[16])
-    return GMMTanhPolicy(
-        net, Bounded(-1, 1, (ACT,), dtype=torch.float64), num_components=3
-    ).double()
+N = 8
 
 
 def make_critic(num_quantiles=N):
@@ -66,30 +59,6 @@ def make_loss(cost_limit=2.5, gamma=0.9, critic=None, estimator=None, **kwargs):
     loss = QuantileCostLoss(make_actor(), critic, cost_limit=cost_limit, **kwargs)
     options = {"lmbda": 0.8} if estimator in ("retrace", "tdlambda") else {}
     return loss.make_value_estimator(estimator, gamma=gamma, **options)
-
-
-def make_data(batch=(4, 6)):
-    generator = torch.Generator().manual_seed(3)
-
-    def rand(*shape):
-        return torch.randn(*batch, *shape, generator=generator, dtype=torch.float64)
-
-    done = torch.rand(*batch, 1, generator=generator) < 0.2
-    terminated = done & (torch.rand(*batch, 1, generator=generator) < 0.5)
-    return TensorDict(
-        {
-            "observation": rand(OBS),
-            "action": rand(ACT).tanh(),
-            "action_log_prob": rand(),
-            "next": {
-                "observation": rand(OBS),
-                "cost": rand(1).sigmoid(),
-                "done": done,
-                "terminated": terminated,
-            },
-        },
-        batch_size=batch,
-    )
 
 
 def predictions(loss, data, action):

@@ -75,7 +75,7 @@ class TestChange:
 
     def test_misuse(self):
         x = torch.zeros(3)
-        with pytest.raises(ValueError, match="same shape"):
+        with pytest.raises(ValueError, match=r"advantage must have shape \(3,\)"):
             surrogate_change(x, x, x, x[:2], 0.9)
         with pytest.raises(ValueError, match=r"gamma must be in \[0, 1\), got 1"):
             surrogate_change(x, x, x, x, 1)

@@ -252,7 +252,7 @@ bad(
     ValueError,
     "log_mu",
     "(3, 1)",
-    "same shape",
+    "that of log_prob",
 )
 EYE = torch.eye(2)
 for name, moments in {

@@ -14,6 +14,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torch.distributions import Categorical, register_kl
 
+from torchrl_safe._checks import check_shape
 from torchrl_safe.modules.distributions import TanhGaussianMixture
 
 __all__ = [
@@ -59,12 +60,12 @@ def moment_matched_kl(
     """
     mean_shape = tuple(old_mean.shape)
     cov_shape = (*mean_shape, *mean_shape[-1:])
-    _check_shapes(
+    for name, tensor, shape in (
         ("old_cov", old_cov, cov_shape),
         ("new_mean", new_mean, mean_shape),
         ("new_cov", new_cov, cov_shape),
-        because=f"old_mean's {mean_shape}",
-    )
+    ):
+        check_shape(name, tensor, shape, f"as old_mean's {mean_shape} says")
     old_mean, old_cov, new_mean, new_cov = _at_least_float32(old_mean, old_cov, new_mean, new_cov)
     new_factor, old_factor = _cholesky(new_cov), _cholesky(old_cov)
     dim = range(old_mean.shape[-1])
@@ -123,14 +124,14 @@ def matched_bound_kl(
         tensor(2.)
     """
     shape = tuple(old_loc.shape)
-    _check_shapes(
+    for name, tensor, expected in (
         ("old_logits", old_logits, shape[:-1]),
         ("old_scale", old_scale, shape),
         ("new_logits", new_logits, shape[:-1]),
         ("new_loc", new_loc, shape),
         ("new_scale", new_scale, shape),
-        because=f"old_loc's {shape}",
-    )
+    ):
+        check_shape(name, tensor, expected, f"as old_loc's {shape} says")
     old_logits, old_loc, old_scale, new_logits, new_loc, new_scale = _at_least_float32(
         old_logits, old_loc, old_scale, new_logits, new_loc, new_scale
     )
@@ -167,8 +168,7 @@ def categorical_kl(old_logits: Tensor, new_logits: Tensor) -> Tensor:
         >>> categorical_kl(torch.tensor([0.5, 0.5]).log(), torch.tensor([0.25, 0.75]).log())
         tensor(0.1438)
     """
-    shape = tuple(old_logits.shape)
-    _check_shapes(("new_logits", new_logits, shape), because=f"old_logits' {shape}")
+    check_shape("new_logits", new_logits, old_logits.shape, "that of old_logits")
     old_logits, new_logits = _at_least_float32(old_logits, new_logits)
     return _weighted_kl(old_logits, new_logits, torch.zeros_like(old_logits))
 
@@ -274,14 +274,6 @@ def _weighted_kl(old_logits: Tensor, new_logits: Tensor, parts: Tensor) -> Tenso
 def _at_least_float32(*tensors: Tensor) -> tuple[Tensor, ...]:
     """Half types, which autocast makes, tell apart no KL of the size of a trust region."""
     return tuple(x.float() if torch.finfo(x.dtype).bits < 32 else x for x in tensors)
-
-
-def _check_shapes(*expected: tuple[str, Tensor, tuple[int, ...]], because: str) -> None:
-    for name, tensor, shape in expected:
-        if tensor.shape != shape:
-            raise ValueError(
-                f"{name} must have shape {shape}, as {because} says, got {tuple(tensor.shape)}."
-            )
 
 
 # Action spaces are small and batches large: unrolled over the action dimensions, products with

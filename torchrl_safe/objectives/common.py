@@ -2,21 +2,39 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import NamedTuple
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal, NamedTuple, TypeAlias
 
 import torch
 from tensordict import TensorDictBase, TensorDictParams
-from tensordict.nn import ProbabilisticTensorDictSequential
-from tensordict.utils import NestedKey, unravel_key
-from torch import Tensor
+from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule
+from tensordict.utils import NestedKey
+from torch import Tensor, nn
 from torch.distributions import Distribution
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+from torchrl.modules.distributions.utils import sample_and_log_prob
 from torchrl.objectives import LossModule
+from torchrl.objectives.utils import ValueEstimators
 from torchrl.objectives.value import ValueEstimatorBase
 
 from torchrl_safe.objectives.functional import check_cost_limit, check_risk_level
-from torchrl_safe.objectives.value import visited_value_estimate
-from torchrl_safe.objectives.value.utils import get_entry, get_time_dim
+from torchrl_safe.objectives.utils import ValueType, as_given, ensemble, make_estimator
+from torchrl_safe.objectives.value import (
+    PolicyEvaluation,
+    RetraceEstimator,
+    visited_value_estimate,
+)
+from torchrl_safe.objectives.value.utils import (
+    behaviour_log_prob,
+    get_entry,
+    get_time_dim,
+    next_key,
+    repair_next,
+    with_action,
+)
+
+Critics: TypeAlias = TensorDictModule | Sequence[TensorDictModule]
 
 
 class Steps(NamedTuple):
@@ -35,7 +53,7 @@ class TrajectoryLoss(LossModule):
         self, tensordict: TensorDictBase, reward_key: NestedKey, estimator: ValueEstimatorBase
     ) -> Steps:
         keys = self.tensor_keys
-        key = unravel_key(("next", reward_key))
+        key = next_key(reward_key)
         reward = get_entry(tensordict, key, "what a step pays, [*B, T, 1]")
         if reward.ndim <= tensordict.batch_dims:
             raise ValueError(
@@ -45,13 +63,11 @@ class TrajectoryLoss(LossModule):
             )
         if not reward.is_floating_point():
             reward = reward.to(torch.get_default_dtype())
-        done = get_entry(tensordict, ("next", keys.done), "the end of trajectories, [*B, T, 1]")
-        terminated = tensordict.get(unravel_key(("next", keys.terminated)), done)
+        done = get_entry(tensordict, next_key(keys.done), "the end of trajectories, [*B, T, 1]")
+        terminated = tensordict.get(next_key(keys.terminated), done)
         for name, flag in ((keys.done, done), (keys.terminated, terminated)):
             if flag.dtype != torch.bool:
-                raise TypeError(
-                    f"{unravel_key(('next', name))!r} must be boolean, got {flag.dtype}."
-                )
+                raise TypeError(f"{next_key(name)!r} must be boolean, got {flag.dtype}.")
         done, terminated = spread(done, reward), spread(terminated, reward)
         mask = self._mask(reward, tensordict)
         dim = get_time_dim(tensordict, getattr(estimator, "time_dim", None))
@@ -194,10 +210,166 @@ class MeasuredCVaR(NamedTuple):
 
 
 class CriticCostLoss(CostLoss):
-    """A loss of a cost whose critics are of states and actions: the constraint on their CVaR."""
+    """A loss of a cost whose critics are of states and actions: the constraint on their CVaR.
+
+    Args:
+        actor_network (ProbabilisticTensorDictSequential): stochastic actor.
+        critics (dict): the critics by the names of their attributes, each a module or a list.
+
+    Keyword Args:
+        num_cost_nets (int): networks of each kind.
+        cost_limit (float): limit on the discounted cost sum, at least 0.
+        risk_level (float): in (0, 1].
+        delay_cost (bool): use target networks for the targets.
+        reduction (str): ``"mean"``, ``"sum"`` or ``"none"``.
+        deactivate_vmap (bool): loop over the networks in place of vmap.
+        use_prioritized_weights (bool or "auto"): weigh samples by ``"priority_weight"``.
+    """
+
+    @dataclass
+    class _AcceptedKeys:
+        """Keys of every loss of this kind.
+
+        Attributes:
+            action (NestedKey): Defaults to ``"action"``.
+            log_prob (NestedKey): Log-density of the action under the policy that took it, read by
+                Retrace. Defaults to ``"action_log_prob"``.
+            cost (NestedKey): Cost of a step, under ``"next"``. Defaults to ``"cost"``.
+            cost_target (NestedKey): What the critic regresses on, used if present.
+                Defaults to ``"cost_target"``.
+            done (NestedKey): Under ``"next"``: cuts the sum. Defaults to ``"done"``.
+            terminated (NestedKey): Under ``"next"``: no cost follows.
+                Defaults to ``"terminated"``.
+            priority_weight (NestedKey): Defaults to ``"priority_weight"``.
+        """
+
+        action: NestedKey = "action"
+        log_prob: NestedKey = "action_log_prob"
+        cost: NestedKey = "cost"
+        cost_target: NestedKey = "cost_target"
+        done: NestedKey = "done"
+        terminated: NestedKey = "terminated"
+        priority_weight: NestedKey = "priority_weight"
+
+    default_keys = _AcceptedKeys
+    SUPPORTED_VALUE_ESTIMATORS = (
+        ValueEstimators.TD0,
+        ValueEstimators.TD1,
+        ValueEstimators.TDLambda,
+        "retrace",
+    )
 
     actor_network: ProbabilisticTensorDictSequential
+    actor_network_params: TensorDictParams
     target_actor_network_params: TensorDictParams
+
+    def __init__(
+        self,
+        actor_network: ProbabilisticTensorDictSequential,
+        critics: dict[str, Critics],
+        *,
+        num_cost_nets: int,
+        cost_limit: float,
+        risk_level: float,
+        delay_cost: bool,
+        reduction: str,
+        deactivate_vmap: bool,
+        use_prioritized_weights: bool | Literal["auto"],
+    ) -> None:
+        self._in_keys: list[NestedKey] | None = None
+        super().__init__()
+        self.use_prioritized_weights = use_prioritized_weights
+        self.convert_to_functional(actor_network, "actor_network", create_target_params=False)
+        self.delay_cost = delay_cost
+        self._critic_names = tuple(critics)
+        for name, network in critics.items():
+            others = [other for other in critics.values() if other is not network]
+            module, expand_dim = as_given(
+                network,
+                num_cost_nets,
+                names=(name, "num_cost_nets"),
+                others=[parameter for other in others for parameter in _parameters(other)],
+            )
+            self.convert_to_functional(
+                module,
+                name,
+                expand_dim,
+                create_target_params=delay_cost,
+                compare_against=list(actor_network.parameters()),
+            )
+        self._register_limit(cost_limit, risk_level)
+        self.reduction = reduction
+        self.deactivate_vmap = deactivate_vmap
+        self._make_vmap()
+
+    @property
+    def _critics(self) -> list[TensorDictModule]:
+        return [getattr(self, name) for name in self._critic_names]
+
+    def _make_vmap(self) -> None:
+        self._ensembles = [
+            ensemble(critic, randomness=self.vmap_randomness, deactivate_vmap=self.deactivate_vmap)
+            for critic in self._critics
+        ]
+
+    def _build_estimator(
+        self, value_type: ValueType | None, gamma: float, **hyperparams: Any
+    ) -> tuple[ValueEstimatorBase, Any]:
+        """An estimator of sums of this cost, and what ``value_type`` is then."""
+        if value_type is None:
+            value_type = self.default_value_estimator
+        for name in ("average_rewards", "group_key"):
+            if hyperparams.get(name):
+                raise ValueError(
+                    f"{name} must be left out, got {hyperparams[name]!r}: standardised costs are "
+                    "not in the unit of cost_limit."
+                )
+        if not 0 <= gamma < 1:
+            raise ValueError(f"gamma must be in [0, 1), got {gamma}.")
+        if isinstance(value_type, str) and value_type.lower() == "retrace":
+            value_type = RetraceEstimator
+        if isinstance(value_type, type) and issubclass(value_type, RetraceEstimator):
+            # On values that the loss computes, in place of networks.
+            return value_type(gamma=gamma, **{"lmbda": 0.97, **hyperparams}), value_type
+        supported = self.SUPPORTED_VALUE_ESTIMATORS
+        return make_estimator(self, value_type, supported=supported, gamma=gamma, **hyperparams)
+
+    def _estimators(self) -> list[ValueEstimatorBase]:
+        """Those that have been made."""
+        return [] if self._value_estimator is None else [self._value_estimator]
+
+    def _forward_value_estimator_keys(self, **kwargs: Any) -> None:
+        for estimator in self._estimators():
+            estimator.set_keys(
+                reward=self.tensor_keys.cost,
+                done=self.tensor_keys.done,
+                terminated=self.tensor_keys.terminated,
+                sample_log_prob=self.tensor_keys.log_prob,
+            )
+        self._in_keys = None
+
+    @property
+    def in_keys(self) -> list[NestedKey]:
+        """Keys that :meth:`forward` reads."""
+        if self._in_keys is None:
+            keys = self.tensor_keys
+            estimator = self._value_estimator
+            kind = self.default_value_estimator if estimator is None else type(estimator)
+            retrace = isinstance(kind, type) and issubclass(kind, RetraceEstimator)
+            in_keys = [
+                keys.action,
+                *([keys.log_prob] if retrace else []),
+                *(next_key(key) for key in (keys.cost, keys.done, keys.terminated)),
+                *self.actor_network.in_keys,
+                *(next_key(key) for key in self.actor_network.in_keys),
+                *(key for critic in self._critics for key in critic.in_keys),
+            ]
+            self._in_keys = list(dict.fromkeys(in_keys))
+        return self._in_keys
+
+    @in_keys.setter
+    def in_keys(self, values: list[NestedKey]) -> None:
+        self._in_keys = values
 
     def cvar(self, tensordict: TensorDictBase, action: Tensor) -> Tensor:
         """What the critics say of states ``[*B]`` and actions, ``[*B]``."""
@@ -291,6 +463,35 @@ class CriticCostLoss(CostLoss):
         change = self._mean(value - measured.reference, tensordict)
         return measured.level + measured.horizon * change - self._limit(cost_limit)
 
+    def _following(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """What actor and critics read of the next states."""
+        in_keys = [key for critic in self._critics for key in critic.in_keys]
+        in_keys = [key for key in in_keys if key != self.tensor_keys.action]
+        for key in in_keys:
+            get_entry(tensordict, next_key(key), "an input of the critic at the next state")
+        in_keys += self.actor_network.in_keys
+        return repair_next(tensordict, in_keys).get("next").select(*in_keys, strict=False)
+
+    def _next_inputs(self, following: TensorDictBase, action: Tensor | None) -> TensorDictBase:
+        """What critics read of next states and actions of the policy there, drawn if not given."""
+        if action is None:
+            with set_exploration_type(ExplorationType.RANDOM):
+                action, _ = sample_and_log_prob(self._target_dist(following))
+        return with_action(following, self.tensor_keys.action, action, *self._critics)
+
+    def _log_probs(
+        self, tensordict: TensorDictBase, policy: PolicyEvaluation | None, cost: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Log-densities of the stored action under the policy and its sampler, ``[*B, T, 1]``."""
+        keys = self.tensor_keys
+        log_mu = behaviour_log_prob(tensordict, keys.log_prob, self.actor_network)
+        if policy is None:
+            action = get_entry(tensordict, keys.action, "the stored action")
+            log_pi = self._target_dist(tensordict).log_prob(action)
+        else:
+            log_pi = policy.log_prob
+        return spread(joint(log_pi), cost[..., :1]), spread(joint(log_mu), cost[..., :1])
+
     def _target_dist(self, tensordict: TensorDictBase) -> Distribution:
         with self.target_actor_network_params.to_module(
             self.actor_network, preserve_module_state=False
@@ -304,9 +505,9 @@ def spread(tensor: Tensor, like: Tensor) -> Tensor:
     return tensor.reshape(*tensor.shape, *missing).expand_as(like)
 
 
-def next_key(key: NestedKey) -> NestedKey:
-    """The key of an entry of the next step."""
-    return unravel_key(("next", key))
+def _parameters(critics: Critics) -> list[nn.Parameter]:
+    networks = [critics] if isinstance(critics, nn.Module) else critics
+    return [parameter for network in networks for parameter in network.parameters()]
 
 
 def joint(log_prob: Tensor | TensorDictBase) -> Tensor:

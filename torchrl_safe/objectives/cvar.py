@@ -9,23 +9,22 @@ import torch
 from tensordict import TensorDict, TensorDictBase, TensorDictParams
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule, dispatch
 from tensordict.utils import NestedKey
-from torch import Tensor, nn
+from torch import Tensor
 from torchrl.envs.utils import ExplorationType, set_exploration_type
-from torchrl.modules.distributions.utils import sample_and_log_prob
 from torchrl.objectives import distance_loss
 from torchrl.objectives.utils import ValueEstimators
 from torchrl.objectives.value import ValueEstimatorBase
 
-from torchrl_safe.objectives.common import CriticCostLoss, joint, next_key, spread
+from torchrl_safe._checks import check_shape
+from torchrl_safe.objectives.common import CriticCostLoss
 from torchrl_safe.objectives.functional import check_regression, gaussian_cvar
-from torchrl_safe.objectives.utils import as_given, ensemble, make_estimator
 from torchrl_safe.objectives.value import (
     PolicyEvaluation,
     RetraceEstimator,
     retrace_variance_reward,
     squared_td_error,
 )
-from torchrl_safe.objectives.value.utils import behaviour_log_prob, get_entry, repair_next
+from torchrl_safe.objectives.value.utils import next_key, with_action
 
 VARIANCE_REWARDS = {"td_error": squared_td_error, "second_moment": retrace_variance_reward}
 
@@ -118,56 +117,29 @@ class CVaRCostLoss(CriticCostLoss):
     """
 
     @dataclass
-    class _AcceptedKeys:
-        """Default values of all configurable tensordict keys.
+    class _AcceptedKeys(CriticCostLoss._AcceptedKeys):
+        """Keys of every loss of a cost with critics of actions, and those of this one.
 
         Attributes:
-            action (NestedKey): Defaults to ``"action"``.
-            log_prob (NestedKey): Log-density of the action under the policy that took it.
-                Defaults to ``"action_log_prob"``.
-            cost (NestedKey): Cost of a step, under ``"next"``. Defaults to ``"cost"``.
             cost_value (NestedKey): Output of the mean critic. Defaults to ``"cost_value"``.
             cost_std (NestedKey): Output of the standard-deviation critic.
                 Defaults to ``"cost_std"``.
-            cost_target (NestedKey): Target of the mean critic, used if present.
-                Defaults to ``"cost_target"``.
-            std_target (NestedKey): Target of the standard-deviation critic, used if present.
-                Defaults to ``"std_target"``.
-            done (NestedKey): Under ``"next"``: cuts the trace. Defaults to ``"done"``.
-            terminated (NestedKey): Under ``"next"``: no cost follows.
-                Defaults to ``"terminated"``.
-            priority_weight (NestedKey): Defaults to ``"priority_weight"``.
+            std_target (NestedKey): Target of the standard-deviation critic, used if present, as
+                ``cost_target`` is that of the mean critic. Defaults to ``"std_target"``.
         """
 
-        action: NestedKey = "action"
-        log_prob: NestedKey = "action_log_prob"
-        cost: NestedKey = "cost"
         cost_value: NestedKey = "cost_value"
         cost_std: NestedKey = "cost_std"
-        cost_target: NestedKey = "cost_target"
         std_target: NestedKey = "std_target"
-        done: NestedKey = "done"
-        terminated: NestedKey = "terminated"
-        priority_weight: NestedKey = "priority_weight"
 
     default_keys = _AcceptedKeys
     tensor_keys: _AcceptedKeys
     default_value_estimator = RetraceEstimator
 
-    SUPPORTED_VALUE_ESTIMATORS = (
-        ValueEstimators.TD0,
-        ValueEstimators.TD1,
-        ValueEstimators.TDLambda,
-        "retrace",
-    )
-
-    actor_network: ProbabilisticTensorDictSequential
     cost_network: TensorDictModule
     std_network: TensorDictModule
-    actor_network_params: TensorDictParams
     cost_network_params: TensorDictParams
     std_network_params: TensorDictParams
-    target_actor_network_params: TensorDictParams
     target_cost_network_params: TensorDictParams
     target_std_network_params: TensorDictParams
 
@@ -193,42 +165,21 @@ class CVaRCostLoss(CriticCostLoss):
                 f"variance_reward must be one of {sorted(VARIANCE_REWARDS)}, "
                 f"got {variance_reward!r}."
             )
-        self._in_keys: list[NestedKey] | None = None
-        super().__init__()
+        super().__init__(
+            actor_network,
+            {"cost_network": cost_network, "std_network": std_network},
+            num_cost_nets=num_cost_nets,
+            cost_limit=cost_limit,
+            risk_level=risk_level,
+            delay_cost=delay_cost,
+            reduction=reduction,
+            deactivate_vmap=deactivate_vmap,
+            use_prioritized_weights=use_prioritized_weights,
+        )
         self.out_keys = ["loss_cost_value", "loss_cost_std", "cost_value", "cost_std"]
-        self.use_prioritized_weights = use_prioritized_weights
-        self.convert_to_functional(actor_network, "actor_network", create_target_params=False)
-        self.delay_cost = delay_cost
-        for name, network, other in (
-            ("cost_network", cost_network, std_network),
-            ("std_network", std_network, cost_network),
-        ):
-            module, expand_dim = as_given(
-                network,
-                num_cost_nets,
-                names=(name, "num_cost_nets"),
-                others=nn.ModuleList(other if isinstance(other, list) else [other]).parameters(),
-            )
-            self.convert_to_functional(
-                module,
-                name,
-                expand_dim,
-                create_target_params=delay_cost,
-                compare_against=list(actor_network.parameters()),
-            )
-        self._register_limit(cost_limit, risk_level)
         self.variance_reward = variance_reward
         self.loss_function = loss_function
-        self.reduction = reduction
-        self.deactivate_vmap = deactivate_vmap
         self._variance_estimator: Any = None
-        self._make_vmap()
-
-    def _make_vmap(self) -> None:
-        self._vmap_cost_network, self._vmap_std_network = (
-            ensemble(network, randomness=self.vmap_randomness, deactivate_vmap=self.deactivate_vmap)
-            for network in (self.cost_network, self.std_network)
-        )
 
     def make_value_estimator(
         self,
@@ -253,74 +204,22 @@ class CVaRCostLoss(CriticCostLoss):
             ValueError: for another ``value_type``, an instance included, if ``gamma`` is outside
                 [0, 1), or for ``average_rewards`` and ``group_key``.
         """
-        if value_type is None or (isinstance(value_type, str) and value_type.lower() == "retrace"):
-            value_type = self.default_value_estimator
         if isinstance(value_type, ValueEstimatorBase):
             raise ValueError(
                 "value_type must be a name, a member of ValueEstimators or a class, got an "
                 f"instance of {type(value_type).__name__}: it has one discount, and the variance "
                 "needs the square of the mean's."
             )
-        for name in ("average_rewards", "group_key"):
-            if hyperparams.get(name):
-                raise ValueError(
-                    f"{name} must be left out, got {hyperparams[name]!r}: standardised costs are "
-                    "not in the unit of cost_limit."
-                )
         gamma = hyperparams.pop("gamma", 0.99)
-        if not 0 <= gamma < 1:
-            raise ValueError(f"gamma must be in [0, 1), got {gamma}.")
-
-        def build(discount: float) -> tuple[ValueEstimatorBase, Any]:
-            if isinstance(value_type, type) and issubclass(value_type, RetraceEstimator):
-                # On values that this loss computes, in place of networks.
-                options = {"lmbda": 0.97, **hyperparams}
-                return value_type(gamma=discount, **options), value_type
-            supported = self.SUPPORTED_VALUE_ESTIMATORS
-            return make_estimator(
-                self, value_type, supported=supported, gamma=discount, **hyperparams
-            )
-
-        estimator, kind = build(gamma)
-        self._variance_estimator, _ = build(gamma**2)
+        estimator, kind = self._build_estimator(value_type, gamma, **hyperparams)
+        self._variance_estimator, _ = self._build_estimator(value_type, gamma**2, **hyperparams)
         self._value_estimator, self.value_type = estimator, kind
         self._forward_value_estimator_keys()
         return self
 
-    def _forward_value_estimator_keys(self, **kwargs: Any) -> None:
-        for estimator in (self._value_estimator, self._variance_estimator):
-            if estimator is not None:
-                estimator.set_keys(
-                    reward=self.tensor_keys.cost,
-                    done=self.tensor_keys.done,
-                    terminated=self.tensor_keys.terminated,
-                    sample_log_prob=self.tensor_keys.log_prob,
-                )
-        self._in_keys = None
-
-    @property
-    def in_keys(self) -> list[NestedKey]:
-        """Keys that :meth:`forward` reads."""
-        if self._in_keys is None:
-            keys = self.tensor_keys
-            self._in_keys = list(
-                dict.fromkeys(
-                    [
-                        keys.action,
-                        keys.log_prob,
-                        *(next_key(key) for key in (keys.cost, keys.done, keys.terminated)),
-                        *self.actor_network.in_keys,
-                        *(next_key(key) for key in self.actor_network.in_keys),
-                        *self.cost_network.in_keys,
-                        *self.std_network.in_keys,
-                    ]
-                )
-            )
-        return self._in_keys
-
-    @in_keys.setter
-    def in_keys(self, values: list[NestedKey]) -> None:
-        self._in_keys = values
+    def _estimators(self) -> list[ValueEstimatorBase]:
+        estimators = (self._value_estimator, self._variance_estimator)
+        return [estimator for estimator in estimators if estimator is not None]
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -401,14 +300,9 @@ class CVaRCostLoss(CriticCostLoss):
                 data.set(estimator_keys.steps_to_next_obs, steps)
             options = {}
             if isinstance(estimator, RetraceEstimator):
-                log_mu = behaviour_log_prob(tensordict, keys.log_prob, self.actor_network)
-                if policy is None:
-                    action = get_entry(tensordict, keys.action, "the stored action")
-                    log_pi = self._target_dist(tensordict).log_prob(action)
-                else:
-                    log_pi = policy.log_prob
-                data.set(keys.log_prob, spread(joint(log_mu), cost[..., :1]))
-                options["policy_log_prob"] = spread(joint(log_pi), cost[..., :1])
+                log_pi, log_mu = self._log_probs(tensordict, policy, cost)
+                data.set(keys.log_prob, log_mu)
+                options["policy_log_prob"] = log_pi
 
             def estimate(
                 estimator: ValueEstimatorBase, reward: Tensor, value: Tensor, next_value: Tensor
@@ -440,7 +334,7 @@ class CVaRCostLoss(CriticCostLoss):
             Mean and standard deviation, in units of the discounted cost sum, ``[*B]`` each.
         """
         mean, std = self._predict(
-            self._inputs(tensordict, action),
+            with_action(tensordict, self.tensor_keys.action, action, *self._critics),
             self.cost_network_params.detach(),
             self.std_network_params.detach(),
         )
@@ -484,7 +378,8 @@ class CVaRCostLoss(CriticCostLoss):
         mean = self._measured_mean(
             tensordict, keys.cost, self.value_estimator, lambda td: self._predict_next(td, None)[0]
         )
-        std = self._vmap_std_network(tensordict, self.std_network_params, keys.cost_std)
+        _, predict_std = self._ensembles
+        std = predict_std(tensordict, self.std_network_params, keys.cost_std)
         std = self._mean(std.squeeze(-1).mean(0), tensordict)
         return gaussian_cvar(mean.to(std), std, self.risk_level)
 
@@ -505,41 +400,24 @@ class CVaRCostLoss(CriticCostLoss):
             )
         shape = (*prediction.shape, 1)
         for key, target in given.items():
-            if target.shape != shape:
-                raise ValueError(
-                    f"{key!r} must have shape {shape}, that of the critics' output, got "
-                    f"{tuple(target.shape)}: compute_target returns it, or set_keys names another "
-                    "entry."
-                )
+            hint = "compute_target returns it, or set_keys names another entry"
+            check_shape(repr(key), target, shape, "that of the critics' output", hint=hint)
         return given[keys[0]].squeeze(-1), given[keys[1]].squeeze(-1)
 
     def _predict_next(
         self, tensordict: TensorDictBase, action: Tensor | None
     ) -> tuple[Tensor, Tensor]:
         """Target critics at the next state and an action of the policy there, ``[*B, 1]`` each."""
-        in_keys = [*self.cost_network.in_keys, *self.std_network.in_keys]
-        for key in in_keys:
-            if key != self.tensor_keys.action:
-                get_entry(tensordict, next_key(key), "an input of the critics at the next state")
-        in_keys += self.actor_network.in_keys
-        following = repair_next(tensordict, in_keys).get("next")
-        if action is None:
-            action, _ = sample_and_log_prob(self._target_dist(following))
         critics = (self.target_cost_network_params, self.target_std_network_params)
-        mean, std = self._predict(self._inputs(following, action), *critics)
+        inputs = self._next_inputs(self._following(tensordict), action)
+        mean, std = self._predict(inputs, *critics)
         return mean.mean(0).unsqueeze(-1), std.mean(0).unsqueeze(-1)
-
-    def _inputs(self, tensordict: TensorDictBase, action: Tensor) -> TensorDictBase:
-        """What the critics read, with another action."""
-        inputs = tensordict.select(
-            *self.cost_network.in_keys, *self.std_network.in_keys, strict=False
-        )
-        return inputs.set(self.tensor_keys.action, action)
 
     def _predict(
         self, inputs: TensorDictBase, cost_params: TensorDictBase, std_params: TensorDictBase
     ) -> tuple[Tensor, Tensor]:
         keys = self.tensor_keys
-        mean = self._vmap_cost_network(inputs, cost_params, keys.cost_value)
-        std = self._vmap_std_network(inputs, std_params, keys.cost_std)
+        predict_mean, predict_std = self._ensembles
+        mean = predict_mean(inputs, cost_params, keys.cost_value)
+        std = predict_std(inputs, std_params, keys.cost_std)
         return mean.squeeze(-1), std.squeeze(-1)

@@ -11,7 +11,8 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from torchrl_safe.objectives.functional import check_count, check_number, check_risk_level
+from torchrl_safe._checks import check_count, check_number, check_shape
+from torchrl_safe.objectives.functional import check_risk_level
 
 __all__ = [
     "cvar_distortion",
@@ -103,7 +104,7 @@ def quantile_loss(
         loss = torch.where(error < 0, 1 - level, level) * huber / kappa
     if weights is None:
         return loss.mean((-2, -1))
-    _check_same("weights", weights, samples, "samples")
+    check_shape("weights", weights, samples.shape, "that of samples")
     return (loss.mean(-2) * weights).sum(-1)
 
 
@@ -203,11 +204,7 @@ def spectral_risk(quantiles: Tensor, weights: Tensor) -> Tensor:
         >>> spectral_risk(torch.tensor([4.0, 0.0]), spectral_weights(2, torch.square))
         tensor(3.)
     """
-    if weights.shape != quantiles.shape[-1:]:
-        raise ValueError(
-            f"weights must have shape {tuple(quantiles.shape[-1:])}, one per quantile, got "
-            f"{tuple(weights.shape)}."
-        )
+    check_shape("weights", weights, quantiles.shape[-1:], "one per quantile")
     return quantiles.sort(-1).values @ weights.to(quantiles)
 
 
@@ -273,11 +270,7 @@ def realised_risk(sums: Tensor, quantiles: Tensor, weights: Tensor) -> Tensor:
     """
     num_quantiles = quantiles.shape[-1]
     _check_batch("sums", sums, quantiles)
-    if weights.shape != (num_quantiles,):
-        raise ValueError(
-            f"weights must have shape {(num_quantiles,)}, one per quantile, got "
-            f"{tuple(weights.shape)}."
-        )
+    check_shape("weights", weights, (num_quantiles,), "one per quantile")
     weights = weights.to(quantiles)
     steps = num_quantiles * weights.diff()
     # The CVaR's spectrum is one step or two; what does not rise costs nothing.
@@ -322,7 +315,7 @@ def project_to_quantiles(
     check_count("num_quantiles", num_quantiles)
     if weights is None:
         weights = torch.full_like(samples, 1 / samples.shape[-1])
-    _check_same("weights", weights, samples, "samples")
+    check_shape("weights", weights, samples.shape, "that of samples")
     samples, order = samples.sort(-1)
     function = weights.double().gather(-1, order).cumsum(-1)
     # Equal samples are one step of F, whatever the signs of their weights.
@@ -376,12 +369,4 @@ def _check_batch(name: str, tensor: Tensor, quantiles: Tensor) -> None:
         raise ValueError(
             f"{name} must have the batch shape of quantiles, {tuple(quantiles.shape[:-1])}, and a "
             f"last dimension of its own, got {tuple(tensor.shape)}."
-        )
-
-
-def _check_same(name: str, tensor: Tensor, like: Tensor, other: str) -> None:
-    if tensor.shape != like.shape:
-        raise ValueError(
-            f"{name} must have the shape of {other}, {tuple(like.shape)}, got "
-            f"{tuple(tensor.shape)}."
         )

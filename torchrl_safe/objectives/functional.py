@@ -7,13 +7,13 @@ functions and add nothing to them.
 from __future__ import annotations
 
 import math
-from numbers import Integral, Real
+from numbers import Real
 from statistics import NormalDist
-from typing import Any
 
 import torch
 from torch import Tensor
 
+from torchrl_safe._checks import check_number, check_shape
 from torchrl_safe._deprecation import moved
 
 __all__ = [
@@ -151,10 +151,7 @@ def gaussian_cvar(mean: Tensor, std: Tensor, risk_level: float) -> Tensor:
         >>> gaussian_cvar(torch.tensor(1.0), torch.tensor(2.0), risk_level=0.5)
         tensor(2.5958)
     """
-    if std.shape != mean.shape:
-        raise ValueError(
-            f"std must have the shape of mean, {tuple(mean.shape)}, got {tuple(std.shape)}."
-        )
+    check_shape("std", std, mean.shape, "that of mean")
     return mean + cvar_factor(risk_level) * std
 
 
@@ -235,21 +232,13 @@ def surrogate_change(
         >>> surrogate_change(log_prob, log_pi, log_pi, advantage, gamma=0.9)
         tensor(2.0000)
     """
-    if not log_prob.shape == log_pi.shape == log_mu.shape == advantage.shape:
-        raise ValueError(
-            "log_prob, log_pi, log_mu and advantage must have the same shape, got "
-            f"{tuple(log_prob.shape)}, {tuple(log_pi.shape)}, {tuple(log_mu.shape)} and "
-            f"{tuple(advantage.shape)}."
-        )
+    for name, tensor in (("log_pi", log_pi), ("log_mu", log_mu), ("advantage", advantage)):
+        check_shape(name, tensor, log_prob.shape, "that of log_prob")
     if not 0 <= gamma < 1:
         raise ValueError(f"gamma must be in [0, 1), got {gamma}.")
     if mask is None:
         mask = torch.ones_like(log_prob, dtype=torch.bool)
-    elif mask.shape != log_prob.shape:
-        raise ValueError(
-            f"mask must have the shape of log_prob, {tuple(log_prob.shape)}, got "
-            f"{tuple(mask.shape)}."
-        )
+    check_shape("mask", mask, log_prob.shape, "that of log_prob")
     # Finite, so that a softmax over weights that are all zero is an average like any other.
     lowest = torch.finfo(log_pi.dtype).min
     log_weight = (log_pi - log_mu).clamp(min=lowest, max=0).masked_fill(~mask, lowest)
@@ -260,44 +249,6 @@ def surrogate_change(
     rise, fall = (torch.where(x, log_ratio, 0) for x in (log_ratio > 0, ~(log_ratio > 0)))
     moved = log_weight.exp() * fall.expm1() - (log_weight + rise).exp() * (-rise).expm1()
     return (moved * (advantage - baseline)).sum() / mask.sum().clamp(min=1) / (1 - gamma)
-
-
-def check_count(name: str, value: int) -> None:
-    """Raise a ``ValueError`` unless ``value`` is an integer of at least 1."""
-    if isinstance(value, bool) or not isinstance(value, Integral) or value < 1:
-        raise ValueError(f"{name} must be an integer, at least 1, got {value!r}.")
-
-
-def check_number(
-    name: str,
-    value: Any,
-    *,
-    positive: bool = False,
-    least: float = -math.inf,
-    most: float = math.inf,
-    instead: str = "",
-) -> None:
-    """Raise a ``ValueError`` unless ``value`` is a finite number, in a range if there is one.
-
-    Args:
-        name (str): of the argument.
-        value (Any): what it was given. A bool is no number.
-
-    Keyword Args:
-        positive (bool): it must be larger than 0.
-        least (float): it must be at least this.
-        most (float): it must be at most this.
-        instead (str): what is allowed besides, for the message.
-    """
-    is_number = isinstance(value, Real) and not isinstance(value, bool) and math.isfinite(value)
-    if is_number and least <= value <= most and (value > 0 or not positive):
-        return
-    low = f", at least {least:g}" if least > -math.inf else ""
-    high = f", at most {most:g}" if most < math.inf else ""
-    raise ValueError(
-        f"{name} must be {instead}a {'positive ' if positive else ''}finite number{low}{high}, got "
-        f"{value!r}."
-    )
 
 
 def check_entropic_index(entropic_index: float) -> None:

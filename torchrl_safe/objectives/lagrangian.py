@@ -12,7 +12,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
-from torchrl_safe.objectives.functional import check_count, check_number
+from torchrl_safe._checks import check_count, check_number, check_shape
 
 __all__ = ["LagrangeMultiplier", "PIDMultiplier", "lagrangian"]
 
@@ -249,10 +249,7 @@ class PIDMultiplier(nn.Module):
 def _checked(constraint: Tensor | Sequence[float], like: Tensor) -> Tensor:
     """A copy of a constraint without gradient, on the device and of the dtype of multipliers."""
     constraint = torch.as_tensor(constraint).detach().to(like, copy=True)
-    if constraint.shape != like.shape:
-        raise ValueError(
-            f"constraint must have shape {tuple(like.shape)}, got {tuple(constraint.shape)}."
-        )
+    check_shape("constraint", constraint, like.shape, "that of the multiplier")
     _check_finite(constraint)
     return constraint
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from torchrl_safe.objectives.functional import check_cost_limit, check_number
+from torchrl_safe._checks import check_number
+from torchrl_safe.objectives.functional import check_cost_limit
 
 __all__ = ["LimitController"]
 

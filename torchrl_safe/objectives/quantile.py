@@ -12,8 +12,6 @@ from tensordict import TensorDict, TensorDictBase, TensorDictParams
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule, dispatch
 from tensordict.utils import NestedKey
 from torch import Tensor
-from torchrl.envs.utils import ExplorationType, set_exploration_type
-from torchrl.modules.distributions.utils import sample_and_log_prob
 from torchrl.objectives.utils import ValueEstimators
 from torchrl.objectives.value import (
     TD0Estimator,
@@ -22,7 +20,8 @@ from torchrl.objectives.value import (
     ValueEstimatorBase,
 )
 
-from torchrl_safe.objectives.common import CriticCostLoss, Steps, joint, next_key, spread
+from torchrl_safe._checks import check_count, check_number, check_shape
+from torchrl_safe.objectives.common import CriticCostLoss, Steps
 from torchrl_safe.objectives.distribution import (
     cvar_distortion,
     draw_from_quantiles,
@@ -31,20 +30,14 @@ from torchrl_safe.objectives.distribution import (
     spectral_risk,
     spectral_weights,
 )
-from torchrl_safe.objectives.functional import check_count, check_number, check_regression
-from torchrl_safe.objectives.utils import as_given, ensemble, make_estimator
+from torchrl_safe.objectives.functional import check_regression
 from torchrl_safe.objectives.value import (
     PolicyEvaluation,
     RetraceEstimator,
     distributional_retrace_estimate,
     sampled_lambda_return_estimate,
 )
-from torchrl_safe.objectives.value.utils import (
-    behaviour_log_prob,
-    get_entry,
-    get_time_dim,
-    repair_next,
-)
+from torchrl_safe.objectives.value.utils import get_time_dim, with_action
 
 LEVELS = ("mean", "realised")
 
@@ -143,48 +136,23 @@ class QuantileCostLoss(CriticCostLoss):
     """
 
     @dataclass
-    class _AcceptedKeys:
-        """Default values of all configurable tensordict keys.
+    class _AcceptedKeys(CriticCostLoss._AcceptedKeys):
+        """Keys of every loss of a cost with critics of actions, and those of this one.
 
         Attributes:
-            action (NestedKey): Defaults to ``"action"``.
-            log_prob (NestedKey): Log-density of the action under the policy that took it, read by
-                Retrace. Defaults to ``"action_log_prob"``.
-            cost (NestedKey): Cost of a step, under ``"next"``. Defaults to ``"cost"``.
             cost_quantiles (NestedKey): Output of the critic. Defaults to ``"cost_quantiles"``.
-            cost_target (NestedKey): Samples to regress on, used if present.
-                Defaults to ``"cost_target"``.
-            target_weight (NestedKey): Their weights, used if present.
-                Defaults to ``"target_weight"``.
-            done (NestedKey): Under ``"next"``: cuts the sum. Defaults to ``"done"``.
-            terminated (NestedKey): Under ``"next"``: no cost follows.
-                Defaults to ``"terminated"``.
-            priority_weight (NestedKey): Defaults to ``"priority_weight"``.
+            target_weight (NestedKey): Weights of the samples under ``cost_target``, used if
+                present. Defaults to ``"target_weight"``.
         """
 
-        action: NestedKey = "action"
-        log_prob: NestedKey = "action_log_prob"
-        cost: NestedKey = "cost"
         cost_quantiles: NestedKey = "cost_quantiles"
-        cost_target: NestedKey = "cost_target"
         target_weight: NestedKey = "target_weight"
-        done: NestedKey = "done"
-        terminated: NestedKey = "terminated"
-        priority_weight: NestedKey = "priority_weight"
 
     default_keys = _AcceptedKeys
     tensor_keys: _AcceptedKeys
     default_value_estimator = ValueEstimators.TD1
 
-    SUPPORTED_VALUE_ESTIMATORS = (
-        ValueEstimators.TD0,
-        ValueEstimators.TD1,
-        ValueEstimators.TDLambda,
-        "retrace",
-    )
-
     cost_network: TensorDictModule
-    actor_network_params: TensorDictParams
     cost_network_params: TensorDictParams
     target_cost_network_params: TensorDictParams
 
@@ -219,38 +187,23 @@ class QuantileCostLoss(CriticCostLoss):
             )
         if distortion is not None:
             spectral_weights(16, distortion)
-        self._in_keys: list[NestedKey] | None = None
-        super().__init__()
+        super().__init__(
+            actor_network,
+            {"cost_network": cost_network},
+            num_cost_nets=num_cost_nets,
+            cost_limit=cost_limit,
+            risk_level=risk_level,
+            delay_cost=delay_cost,
+            reduction=reduction,
+            deactivate_vmap=deactivate_vmap,
+            use_prioritized_weights=use_prioritized_weights,
+        )
         self.out_keys = ["loss_cost_quantiles", "cost_value", "cost_std"]
-        self.use_prioritized_weights = use_prioritized_weights
-        self.convert_to_functional(actor_network, "actor_network", create_target_params=False)
-        self.delay_cost = delay_cost
-        module, expand_dim = as_given(
-            cost_network, num_cost_nets, names=("cost_network", "num_cost_nets")
-        )
-        self.convert_to_functional(
-            module,
-            "cost_network",
-            expand_dim,
-            create_target_params=delay_cost,
-            compare_against=list(actor_network.parameters()),
-        )
-        self._register_limit(cost_limit, risk_level)
         self.distortion = distortion
         self.level = level
         self.pessimism = pessimism
         self.num_samples = num_samples
         self.kappa = kappa
-        self.reduction = reduction
-        self.deactivate_vmap = deactivate_vmap
-        self._make_vmap()
-
-    def _make_vmap(self) -> None:
-        self._vmap_cost_network = ensemble(
-            self.cost_network,
-            randomness=self.vmap_randomness,
-            deactivate_vmap=self.deactivate_vmap,
-        )
 
     def make_value_estimator(
         self,
@@ -275,28 +228,8 @@ class QuantileCostLoss(CriticCostLoss):
             ValueError: for another ``value_type``, or if ``gamma`` is outside [0, 1) or ``lmbda``
                 outside [0, 1].
         """
-        if value_type is None:
-            value_type = self.default_value_estimator
-        if isinstance(value_type, str) and value_type.lower() == "retrace":
-            value_type = RetraceEstimator
-        for name in ("average_rewards", "group_key"):
-            if hyperparams.get(name):
-                raise ValueError(
-                    f"{name} must be left out, got {hyperparams[name]!r}: standardised costs are "
-                    "not in the unit of cost_limit."
-                )
         gamma = hyperparams.pop("gamma", 0.99)
-        if not 0 <= gamma < 1:
-            raise ValueError(f"gamma must be in [0, 1), got {gamma}.")
-        estimator: ValueEstimatorBase
-        if isinstance(value_type, type) and issubclass(value_type, RetraceEstimator):
-            estimator = value_type(gamma=gamma, **{"lmbda": 0.97, **hyperparams})
-            kind: Any = value_type
-        else:
-            supported = self.SUPPORTED_VALUE_ESTIMATORS
-            estimator, kind = make_estimator(
-                self, value_type, supported=supported, gamma=gamma, **hyperparams
-            )
+        estimator, kind = self._build_estimator(value_type, gamma, **hyperparams)
         known = (RetraceEstimator, TDLambdaEstimator, TD0Estimator, TD1Estimator)
         if not isinstance(estimator, known):
             raise ValueError(
@@ -306,37 +239,6 @@ class QuantileCostLoss(CriticCostLoss):
         self._value_estimator, self.value_type = estimator, kind
         self._forward_value_estimator_keys()
         return self
-
-    def _forward_value_estimator_keys(self, **kwargs: Any) -> None:
-        if self._value_estimator is not None:
-            self._value_estimator.set_keys(
-                reward=self.tensor_keys.cost,
-                done=self.tensor_keys.done,
-                terminated=self.tensor_keys.terminated,
-                sample_log_prob=self.tensor_keys.log_prob,
-            )
-        self._in_keys = None
-
-    @property
-    def in_keys(self) -> list[NestedKey]:
-        """Keys that :meth:`forward` reads."""
-        if self._in_keys is None:
-            keys = self.tensor_keys
-            in_keys = [
-                keys.action,
-                *(next_key(key) for key in (keys.cost, keys.done, keys.terminated)),
-                *self.actor_network.in_keys,
-                *(next_key(key) for key in self.actor_network.in_keys),
-                *self.cost_network.in_keys,
-            ]
-            if isinstance(self._value_estimator, RetraceEstimator):
-                in_keys.append(keys.log_prob)
-            self._in_keys = list(dict.fromkeys(in_keys))
-        return self._in_keys
-
-    @in_keys.setter
-    def in_keys(self, values: list[NestedKey]) -> None:
-        self._in_keys = values
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -403,19 +305,11 @@ class QuantileCostLoss(CriticCostLoss):
         if not isinstance(estimator, RetraceEstimator):
             samples = self._sums(tensordict, steps, discount, _decay(estimator), next_action)
             return samples, torch.full_like(samples, 1 / samples.shape[-1])
-        keys = self.tensor_keys
-        if policy is None:
-            action = get_entry(tensordict, keys.action, "the stored action")
-            log_pi = self._target_dist(tensordict).log_prob(action)
-        else:
-            log_pi = policy.log_prob
-        log_mu = behaviour_log_prob(tensordict, keys.log_prob, self.actor_network)
         quantiles = _average(self._predict(tensordict, self.target_cost_network_params))
         return distributional_retrace_estimate(
             discount,
             _decay(estimator),
-            spread(joint(log_pi), steps.reward),
-            spread(joint(log_mu), steps.reward),
+            *self._log_probs(tensordict, policy, steps.reward),
             draw_from_quantiles(quantiles, self.num_samples).masked_fill(~steps.mask, 0),
             self._draw_next(tensordict, steps, torch.ones_like(steps.done), next_action),
             *steps[:3],
@@ -539,11 +433,8 @@ class QuantileCostLoss(CriticCostLoss):
                 f"[{', '.join(map(str, quantiles.shape[:-1]))}, M], got {tuple(samples.shape)}: "
                 "compute_target returns them, or set_keys names another entry."
             )
-        if weights.shape != samples.shape:
-            raise ValueError(
-                f"{keys.target_weight!r} must have shape {tuple(samples.shape)}, that of "
-                f"{keys.cost_target!r}, got {tuple(weights.shape)}."
-            )
+        origin = f"that of {keys.cost_target!r}"
+        check_shape(repr(keys.target_weight), weights, samples.shape, origin)
         return samples, weights
 
     def _sums(
@@ -581,30 +472,19 @@ class QuantileCostLoss(CriticCostLoss):
             samples[where] = draw_from_quantiles(quantiles, self.num_samples).to(samples)
         return samples.masked_fill(~steps.mask, 0)
 
-    def _following(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """What actor and critic read of the next states."""
-        in_keys = [key for key in self.cost_network.in_keys if key != self.tensor_keys.action]
-        for key in in_keys:
-            get_entry(tensordict, next_key(key), "an input of the critic at the next state")
-        in_keys += self.actor_network.in_keys
-        return repair_next(tensordict, in_keys).get("next").select(*in_keys, strict=False)
-
     def _predict_next(self, following: TensorDictBase, action: Tensor | None) -> Tensor:
         """Target critic at next states and actions of the policy there, ``[*B, N]``."""
-        if action is None:
-            with set_exploration_type(ExplorationType.RANDOM):
-                action, _ = sample_and_log_prob(self._target_dist(following))
-        inputs = following.set(self.tensor_keys.action, action)
+        inputs = self._next_inputs(following, action)
         return _average(self._predict(inputs, self.target_cost_network_params))
 
     def _predict_at(self, tensordict: TensorDictBase, action: Tensor) -> Tensor:
-        inputs = tensordict.select(*self.cost_network.in_keys, strict=False)
-        inputs.set(self.tensor_keys.action, action)
+        inputs = with_action(tensordict, self.tensor_keys.action, action, *self._critics)
         return self._predict(inputs, self.cost_network_params.detach())
 
     def _predict(self, inputs: TensorDictBase, params: TensorDictBase) -> Tensor:
         """Quantiles of every network, ``[E, *B, N]``."""
-        return self._vmap_cost_network(inputs, params, self.tensor_keys.cost_quantiles)
+        (predict,) = self._ensembles
+        return predict(inputs, params, self.tensor_keys.cost_quantiles)
 
     def _weights(self, quantiles: Tensor) -> Tensor:
         distortion = self.distortion or partial(cvar_distortion, risk_level=self.risk_level)

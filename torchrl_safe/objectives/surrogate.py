@@ -15,6 +15,7 @@ from torchrl.objectives import distance_loss
 from torchrl.objectives.utils import ValueEstimators
 from torchrl.objectives.value import ValueEstimatorBase
 
+from torchrl_safe._checks import check_shape
 from torchrl_safe.objectives.common import CostLoss, Steps, TrajectoryLoss, spread
 from torchrl_safe.objectives.functional import check_regression, gaussian_cvar, surrogate_change
 from torchrl_safe.objectives.value import (
@@ -22,7 +23,7 @@ from torchrl_safe.objectives.value import (
     retrace_variance_reward,
     squared_td_error,
 )
-from torchrl_safe.objectives.value.utils import get_entry, repair_next
+from torchrl_safe.objectives.value.utils import get_entry, next_key, repair_next
 
 
 class CostMoments(NamedTuple):
@@ -104,7 +105,7 @@ class _SurrogateLoss(TrajectoryLoss):
         """A critic's prediction of the next state, [*B, 1]."""
         in_keys = getattr(self, name).in_keys
         for in_key in in_keys:
-            get_entry(tensordict, ("next", in_key), f"an input of {name} at the next state")
+            get_entry(tensordict, next_key(in_key), f"an input of {name} at the next state")
         return self._value(name, key, repair_next(tensordict, in_keys).get("next"))
 
     def _values(
@@ -188,12 +189,8 @@ class _SurrogateLoss(TrajectoryLoss):
 
     def _regression(self, prediction: Tensor, key: NestedKey, tensordict: TensorDictBase) -> Tensor:
         target = self._computed(tensordict, key)
-        if target.shape != prediction.shape:
-            raise ValueError(
-                f"{key!r} must have shape {tuple(prediction.shape)}, that of the critic's output, "
-                f"got {tuple(target.shape)}: compute_advantage writes it, or set_keys names "
-                "another entry."
-            )
+        hint = "compute_advantage writes it, or set_keys names another entry"
+        check_shape(repr(key), target, prediction.shape, "that of the critic's output", hint=hint)
         loss = distance_loss(prediction, target, self.loss_function).squeeze(-1)
         return self._reduce_loss(loss, tensordict=tensordict, weights=None)
 

@@ -21,16 +21,16 @@ from torchrl.modules.distributions.utils import rsample_and_log_prob, sample_and
 from torchrl.objectives import SACLoss, ValueEstimators, distance_loss
 from torchrl.objectives.value import ValueEstimatorBase
 
+from torchrl_safe._checks import check_number, check_shape
 from torchrl_safe.objectives.functional import (
     check_entropic_index,
-    check_number,
     check_regression,
     q_logarithm,
     uniform_tsallis_entropy,
 )
 from torchrl_safe.objectives.utils import as_given, ensemble, make_estimator
 from torchrl_safe.objectives.value import PolicyEvaluation, RetraceEstimator
-from torchrl_safe.objectives.value.utils import get_entry, repair_next
+from torchrl_safe.objectives.value.utils import get_entry, repair_next, with_action
 
 
 class TsallisLoss(SACLoss):
@@ -449,11 +449,8 @@ class TsallisLoss(SACLoss):
                 f"{tuple(tensordict.batch_size)}, got {tuple(reward.shape)}; unsqueeze it."
             )
         for key, flag in ((keys.done, done), (keys.terminated, terminated)):
-            if flag.shape != reward.shape:
-                raise ValueError(
-                    f"{key!r} must have the shape of {keys.reward!r}, {tuple(reward.shape)}, got "
-                    f"{tuple(flag.shape)}; unsqueeze or expand it."
-                )
+            origin = f"that of {keys.reward!r}"
+            check_shape(repr(key), flag, reward.shape, origin, hint="unsqueeze or expand it")
         with (
             torch.no_grad(),
             set_exploration_type(ExplorationType.RANDOM),
@@ -487,11 +484,8 @@ class TsallisLoss(SACLoss):
             if alive is not None:
                 value = value.new_zeros(alive.shape).masked_scatter_(alive, value)
             value = value.unsqueeze(-1)
-            if value.shape != reward.shape:
-                raise ValueError(
-                    f"{keys.state_action_value!r} must have the shape of {keys.reward!r}, "
-                    f"{tuple(reward.shape)}, got {tuple(value.shape)}."
-                )
+            origin = f"that of {keys.reward!r}"
+            check_shape(repr(keys.state_action_value), value, reward.shape, origin)
             if not reward.is_floating_point():
                 next_tensordict.set(keys.reward, reward.to(value.dtype))
             next_tensordict.set(self.value_estimator.tensor_keys.value, value)
@@ -521,11 +515,8 @@ class TsallisLoss(SACLoss):
         prediction = self._vmap_qnetworkN0(
             tensordict, self.qvalue_network_params, keys.state_action_value
         )
-        if target.shape != prediction.shape[1:]:
-            raise ValueError(
-                f"{keys.qvalue_target!r} must have the shape of the critic's value, "
-                f"{tuple(prediction.shape[1:])}, got {tuple(target.shape)}."
-            )
+        origin = "that of the critic's value"
+        check_shape(repr(keys.qvalue_target), target, prediction.shape[1:], origin)
         prediction, target = prediction.squeeze(-1), target.squeeze(-1)
         td_error = (prediction.detach() - target).abs().max(0)[0]
         loss = distance_loss(prediction, target.expand_as(prediction), self.loss_function).sum(0)
@@ -539,9 +530,6 @@ class TsallisLoss(SACLoss):
         params: TensorDictBase,
     ) -> Tensor:
         keys = self.tensor_keys
-        inputs = tensordict.select(*self.qvalue_network.in_keys, strict=False)
-        inputs.set(keys.action, action)
-        for key in self.qvalue_network.in_keys:
-            get_entry(inputs, key, "an input of qvalue_network")
+        inputs = with_action(tensordict, keys.action, action, self.qvalue_network)
         values = self._vmap_qnetworkN0(inputs, params, keys.state_action_value)
         return values.squeeze(-1).min(0)[0]

@@ -16,7 +16,7 @@ from torchrl.objectives import LossModule
 from torchrl.objectives.utils import ValueEstimators, build_value_estimator
 from torchrl.objectives.value import ValueEstimatorBase
 
-from torchrl_safe.objectives.functional import check_count, check_number
+from torchrl_safe._checks import check_count, check_number
 
 Ensemble = Callable[[TensorDictBase, TensorDictBase, NestedKey], Tensor]
 ValueType: TypeAlias = ValueEstimators | str | type[ValueEstimatorBase] | ValueEstimatorBase

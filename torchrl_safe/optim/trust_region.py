@@ -59,7 +59,8 @@ class TrustRegionReport:
         objective (float): before the step.
         objective_change (float): what the step did.
         objective_predicted (float): what it should have done.
-        constraint (tuple of float): before the step, [m].
+        constraint (tuple of float): before the step, [m]; feasible at or below 0, so that a limit
+            on a cost has been taken off.
         constraint_change (tuple of float): what the step did, [m].
         constraint_predicted (tuple of float): what it should have done, [m].
         cg_residual (float): largest relative residual of the conjugate gradients' systems.

@@ -31,6 +31,7 @@ from torchrl_safe.objectives.value.utils import (
     behaviour_log_prob,
     get_entry,
     get_time_dim,
+    next_key,
     repair_next,
 )
 
@@ -344,7 +345,7 @@ class RetraceEstimator(ValueEstimatorBase):
             *actor_keys,
             *critic_keys,
             keys.sample_log_prob,
-            *(unravel_key(("next", key)) for key in next_keys if key != keys.action),
+            *(next_key(key) for key in next_keys if key != keys.action),
         ]
         if self.group_key is not None:
             in_keys.append(self.group_key)
@@ -466,7 +467,7 @@ class RetraceEstimator(ValueEstimatorBase):
         time_dim: int,
     ) -> Tensor:
         keys = self.tensor_keys
-        reward = get_entry(tensordict, ("next", keys.reward), "the reward, [*B, T, 1]")
+        reward = get_entry(tensordict, next_key(keys.reward), "the reward, [*B, T, 1]")
         if not reward.is_floating_point():
             reward = reward.to(next_value.dtype)
         gamma = self.gamma
@@ -480,15 +481,15 @@ class RetraceEstimator(ValueEstimatorBase):
             else:
                 reward = _standardize_by_group(reward, groups)
         log_mu = behaviour_log_prob(tensordict, keys.sample_log_prob, self.actor_network)
-        done = get_entry(tensordict, ("next", keys.done), "the end of trajectories, [*B, T, 1]")
-        terminated = tensordict.get(unravel_key(("next", keys.terminated)), done)
+        done = get_entry(tensordict, next_key(keys.done), "the end of trajectories, [*B, T, 1]")
+        terminated = tensordict.get(next_key(keys.terminated), done)
         log_pi, log_mu, done, terminated = (
             _of_steps(key, tensor, reward, tensordict)
             for key, tensor in (
                 (keys.policy_log_prob, log_pi),
                 (keys.sample_log_prob, log_mu),
-                (("next", keys.done), done),
-                (("next", keys.terminated), terminated),
+                (next_key(keys.done), done),
+                (next_key(keys.terminated), terminated),
             )
         )
         return trace_lambda_return_estimate(
@@ -513,7 +514,7 @@ class RetraceEstimator(ValueEstimatorBase):
         if self.actor_network is None and self.qvalue_network is None:
             return self.value_network is not None
         keys = self.tensor_keys
-        outputs = (keys.policy_log_prob, keys.state_action_value, ("next", keys.value))
+        outputs = (keys.policy_log_prob, keys.state_action_value, next_key(keys.value))
         present = (tensordict.get(unravel_key(key), None) is not None for key in outputs)
         return not (skip_existing() and all(present))
 
@@ -577,7 +578,7 @@ class RetraceEstimator(ValueEstimatorBase):
         target_params: TensorDictBase | None,
         critic_params: TensorDictBase | None,
     ) -> Tensor:
-        key = unravel_key(("next", self.tensor_keys.value))
+        key = next_key(self.tensor_keys.value)
         tied = self._loss_module is not None
         sampled = self.actor_network is not None and self.qvalue_network is not None
         computes = self.value_network is not None or (sampled and not tied)

@@ -8,9 +8,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from torchrl_safe._checks import check_shape
 from torchrl_safe.objectives.value.functional import (
     _check_boolean,
-    _check_shape,
     _check_time_dim,
     _coefficient,
     _log_trace,
@@ -90,7 +90,7 @@ def sampled_lambda_return_estimate(
     shape = next_samples.shape
     single = (*shape[:-1], 1)
     for name, tensor in (("reward", reward), ("done", done), ("terminated", terminated)):
-        _check_shape(name, tensor, single, "that of next_samples with one sample")
+        check_shape(name, tensor, single, "that of next_samples with one sample")
     _check_boolean("done", done)
     _check_boolean("terminated", terminated)
     _coefficient("lmbda", lmbda, ())
@@ -197,9 +197,9 @@ def distributional_retrace_estimate(
     single = (*shape[:-1], 1)
     _check_time_dim(time_dim, shape, "reward")
     for name, tensor in (("reward", reward), ("done", done), ("terminated", terminated)):
-        _check_shape(name, tensor, single, "one number per step")
-    _check_shape("samples", samples, (*shape[:-1], *samples.shape[-1:]), "that of reward")
-    _check_shape("next_samples", next_samples, samples.shape, "that of samples")
+        check_shape(name, tensor, single, "one number per step")
+    check_shape("samples", samples, (*shape[:-1], *samples.shape[-1:]), "that of reward")
+    check_shape("next_samples", next_samples, samples.shape, "that of samples")
     _check_boolean("done", done)
     _check_boolean("terminated", terminated)
     gamma = _coefficient("gamma", gamma, shape)

@@ -7,6 +7,8 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor
 
+from torchrl_safe._checks import check_shape
+
 __all__ = [
     "retrace_variance_reward",
     "squared_td_error",
@@ -127,10 +129,10 @@ def trace_lambda_return_estimate(
     terminated = done if terminated is None else terminated
     shape = reward.shape
     _check_time_dim(time_dim, shape, "reward")
-    _check_shape("action_value", action_value, shape, "that of reward")
-    _check_shape("next_state_value", next_state_value, shape, "that of reward")
-    _check_shape("done", done, shape, "that of reward")
-    _check_shape("terminated", terminated, shape, "that of reward")
+    check_shape("action_value", action_value, shape, "that of reward")
+    check_shape("next_state_value", next_state_value, shape, "that of reward")
+    check_shape("done", done, shape, "that of reward")
+    check_shape("terminated", terminated, shape, "that of reward")
     _check_boolean("done", done)
     _check_boolean("terminated", terminated)
     log_trace = _log_trace(trace, log_pi, log_mu, reward)
@@ -332,10 +334,10 @@ def visited_value_estimate(
         mask = torch.ones_like(reward, dtype=torch.bool)
     if next_value is None:
         next_value = torch.zeros_like(reward)
-    _check_shape("next_value", next_value, reward.shape, "that of reward")
-    _check_shape("mask", mask, reward.shape, "that of reward")
-    _check_shape("done", done, reward.shape, "that of reward")
-    _check_shape("terminated", terminated, reward.shape, "that of reward")
+    check_shape("next_value", next_value, reward.shape, "that of reward")
+    check_shape("mask", mask, reward.shape, "that of reward")
+    check_shape("done", done, reward.shape, "that of reward")
+    check_shape("terminated", terminated, reward.shape, "that of reward")
     _check_boolean("done", done)
     _check_boolean("terminated", terminated)
     ends = done | terminated | ~_shift(mask, -1, time_dim)
@@ -381,7 +383,7 @@ def _one_step_cost(
         ("next_action_value", next_action_value),
         ("terminated", terminated),
     ):
-        _check_shape(name, tensor, cost.shape, "that of cost")
+        check_shape(name, tensor, cost.shape, "that of cost")
     _check_boolean("terminated", terminated)
     gamma = _coefficient("gamma", gamma, cost.shape)
     return cost + gamma * torch.where(terminated, 0, next_action_value)
@@ -398,7 +400,7 @@ def _log_trace(trace: str, log_pi: Tensor | None, log_mu: Tensor | None, reward:
     for i, (name, given) in enumerate([("log_pi", log_pi), ("log_mu", log_mu)][:count]):
         if given is None:
             raise ValueError(f"{name} must be a tensor for trace={trace!r}, got None.")
-        _check_shape(name, given, (*reward.shape[:-1], 1), "that of reward with one feature")
+        check_shape(name, given, (*reward.shape[:-1], 1), "that of reward with one feature")
         densities[i] = given
     return log_coefficient(*densities)
 
@@ -464,13 +466,6 @@ def _coefficient(name: str, value: float | Tensor, shape: Sequence[int]) -> floa
             f"{tuple(shape)} with as many dimensions, got a tensor of shape {tuple(value.shape)}."
         )
     return value
-
-
-def _check_shape(name: str, tensor: Tensor, expected: Sequence[int], origin: str) -> None:
-    if tensor.shape != tuple(expected):
-        raise ValueError(
-            f"{name} must have shape {tuple(expected)}, {origin}, got {tuple(tensor.shape)}."
-        )
 
 
 def _check_time_dim(time_dim: int, shape: Sequence[int], name: str) -> None:

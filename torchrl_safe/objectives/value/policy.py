@@ -10,7 +10,7 @@ from tensordict.nn import ProbabilisticTensorDictSequential
 from torch import Tensor
 from torchrl.modules.distributions.utils import sample_and_log_prob
 
-from torchrl_safe.objectives.value.utils import get_entry, get_time_dim, repair_next
+from torchrl_safe.objectives.value.utils import get_entry, get_time_dim, next_key, repair_next
 
 __all__ = ["PolicyEvaluation", "evaluate_policy"]
 
@@ -93,7 +93,7 @@ def evaluate_policy(
     action = get_entry(tensordict, actor.dist_sample_keys[0], "the stored action")
     for key in actor.in_keys:
         get_entry(tensordict, key, "an input of the actor")
-        get_entry(tensordict, ("next", key), "an input of the actor at the next state")
+        get_entry(tensordict, next_key(key), "an input of the actor at the next state")
     following = repair_next(tensordict, actor.in_keys).get("next")
     states, next_states = (td.select(*actor.in_keys) for td in (tensordict, following))
     if shifted:

@@ -12,6 +12,11 @@ from torch import Tensor
 from torchrl.data import Bounded
 
 
+def next_key(key: NestedKey) -> NestedKey:
+    """The key of an entry of the next step."""
+    return unravel_key(("next", key))
+
+
 def get_entry(tensordict: TensorDictBase, key: NestedKey, what: str) -> Tensor:
     """An entry; where it is missing, a ``KeyError`` says what it is and what there is instead."""
     key = unravel_key(key)
@@ -23,6 +28,20 @@ def get_entry(tensordict: TensorDictBase, key: NestedKey, what: str) -> Tensor:
             f"{tuple(tensordict.batch_size)}, which has {present}."
         )
     return value
+
+
+def with_action(
+    tensordict: TensorDictBase,
+    action_key: NestedKey,
+    action: Tensor | TensorDictBase,
+    *critics: TensorDictModule,
+) -> TensorDictBase:
+    """What critics of states and actions read, with another action; errors name what is missing."""
+    in_keys = [key for critic in critics for key in critic.in_keys]
+    inputs = tensordict.select(*in_keys, strict=False).set(action_key, action)
+    for key in in_keys:
+        get_entry(inputs, key, "an input of the critic")
+    return inputs
 
 
 def behaviour_log_prob(
@@ -77,12 +96,11 @@ def repair_next(tensordict: TensorDictBase, keys: Sequence[NestedKey]) -> Tensor
     """
     tensordict = tensordict.copy()
     for key in keys:
-        next_key = unravel_key(("next", key))
-        value, following = tensordict.get(key, None), tensordict.get(next_key, None)
+        value, following = tensordict.get(key, None), tensordict.get(next_key(key), None)
         if value is None or following is None or value.shape != following.shape:
             continue
         if key == "is_init":
-            tensordict.set(next_key, value | following)
+            tensordict.set(next_key(key), value | following)
         elif isinstance(following, Tensor) and following.is_floating_point():
-            tensordict.set(next_key, torch.where(following.isnan(), value, following))
+            tensordict.set(next_key(key), torch.where(following.isnan(), value, following))
     return tensordict

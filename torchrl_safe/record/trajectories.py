@@ -14,6 +14,7 @@ from tensordict import TensorDictBase
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType
 
+from torchrl_safe._extras import need
 from torchrl_safe._files import expand, replacing
 from torchrl_safe.record.metrics import acting
 
@@ -155,6 +156,7 @@ def plot_trajectories(
     """
     if not trajectories:
         raise ValueError("trajectories must hold at least one, got none.")
+    need("a plot", "train", "matplotlib")
     from matplotlib.figure import Figure
     from matplotlib.patches import Circle, Rectangle
 

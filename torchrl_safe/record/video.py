@@ -8,13 +8,13 @@ from collections.abc import Callable, Sequence
 from contextlib import closing
 from pathlib import Path
 
-import imageio.v2 as imageio
 import numpy as np
 import torch
 from tensordict import TensorDictBase
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType
 
+from torchrl_safe._extras import need
 from torchrl_safe._files import expand, replacing
 from torchrl_safe.record.metrics import acting
 
@@ -101,6 +101,9 @@ def record_video(
                 f"the environment could not render ({type(error).__name__}: {error}); without a "
                 "display, MUJOCO_GL=egl or MUJOCO_GL=osmesa renders off screen where installed."
             ) from error
+
+    need("a video", "train", "imageio", "imageio_ffmpeg")
+    import imageio.v2 as imageio
 
     path.parent.mkdir(parents=True, exist_ok=True)
     with replacing(path) as draft:

@@ -67,7 +67,7 @@ class TestCommandLine:
         )
         METHODS["cpo"](options=options).train()
         logged = curves(run_dir)
-        assert set(logged["update/cost_limit"]) == {pytest.approx(10.0)}
+        assert logged["update/cost_limit"] == pytest.approx([10.0, 10.0])
         # CPO's level is the mean of the cost per step, of eval.num_steps=20 steps.
         rates = logged["train/cost_rate"]
         assert logged["update/cost_level"] == pytest.approx([20 * r for r in rates], abs=1e-6)

@@ -7,7 +7,6 @@ import torch
 from omegaconf import OmegaConf
 from tensordict import TensorDict
 from torch import nn
-
 from torchrl_safe.trainers.descent import Descent
 
 

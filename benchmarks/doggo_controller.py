@@ -35,7 +35,7 @@ from torchrl_safe.record import format_table
 from torchrl_safe.trainers import cli
 from torchrl_safe.trainers import options as shared
 from torchrl_safe.trainers.collectors import ResumableCollector
-from torchrl_safe.trainers.options import Group, again, option
+from torchrl_safe.trainers.options import Group, again, check_widths, option
 from torchrl_safe.trainers.run import Run
 from torchrl_safe.trainers.streams import stream_seed
 from torchrl_safe.trainers.terminal import GracefulStop, progress_bar, say
@@ -91,6 +91,11 @@ class Policy(Group):
 
     num_cells: list[int] = again(shared.Policy, "num_cells", [64, 64])
     init_std: float = option(0.15, "of the torques' noise, before tanh", gt=0, fixed=True)
+
+    @field_validator("num_cells")
+    @classmethod
+    def _check_widths(cls, value: list[int]) -> list[int]:
+        return check_widths(value)
 
 
 class Collector(Group):
@@ -160,7 +165,10 @@ class Options(shared.Options):
     @field_validator("gait")
     @classmethod
     def _check_gait(cls, value: list[dict[str, Any]]) -> list[dict[str, Any]]:
-        return [Stage(**stage).model_dump() for stage in value]
+        try:
+            return [Stage(**stage).model_dump() for stage in value]
+        except ValueError:
+            raise ValueError("no gait") from None
 
     @property
     def folder(self) -> str:

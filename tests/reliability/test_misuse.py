@@ -8,17 +8,16 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from functools import cache, partial, reduce
-from pathlib import Path
 from typing import Any, NamedTuple
 
+import doggo_controller
 import gymnasium
-import hydra
 import numpy as np
 import pytest
+import retrace_sac
 import torch
-from omegaconf import OmegaConf
 from tensordict import TensorDict
 from tensordict.nn import (
     CompositeDistribution,
@@ -64,7 +63,8 @@ from torchrl_safe.objectives import (
     value,
 )
 from torchrl_safe.objectives import functional as F
-from torchrl_safe.trainers import config
+from torchrl_safe.trainers import METHODS
+from torchrl_safe.trainers.options import describe
 
 NAN, INF = math.nan, math.inf
 SPEC = Bounded(-1.0, 1.0, (2,))
@@ -1512,20 +1512,25 @@ def test_api(name, monkeypatch, tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-# Configurations.
+# Options.
 
-EXAMPLES = Path(config.__file__).parent
-CONFIGS = sorted(path.stem for path in EXAMPLES.glob("*.yaml"))
+KINDS = {
+    **{name: method.Options for name, method in METHODS.items()},
+    "doggo_controller": doggo_controller.Options,
+    "retrace_sac": retrace_sac.Options,
+}
 
-# One impossible value for each option of each example, and what its message says is allowed.
+# One impossible value for each option of each method, and what its message says is allowed.
 IMPOSSIBLE = {
-    "script": ("unknown", "'safetac_point'"),
     "seed": (-1, "at least 0"),
     "num_threads": (0, "at least 1"),
-    "run_dir": ("", "a path"),
+    "run_dir": ("", "null or a path"),
     "resume": (1, "one of True, False"),
     "update": ("newton", "'trust_region', 'lagrangian', 'pid'"),
     "env.name": ("", "a name"),
+    "env.task": ("chess", "null or one of"),
+    "env.id": ("", "null or a name"),
+    "env.cost": ("", "null or a name"),
     "env.robot": ("unicycle", "'point'"),
     "env.num_envs": (0, "at least 1"),
     "env.episode_length": (0, "at least 1"),
@@ -1562,6 +1567,7 @@ IMPOSSIBLE = {
     "loss.lmbda": (1.1, "[0, 1]"),
     "loss.risk_level": (0.0, "(0, 1]"),
     "loss.cost_limit": (-1.0, "[0, inf)"),
+    "loss.limit_unit": ("week", "'discounted', 'step', 'episode'"),
     "loss.initial_cost_limit": (math.inf, "[0, inf)"),
     "loss.anneal_frames": (-1, "at least 0"),
     "loss.variance_reward": ("none", "'td_error', 'second_moment'"),
@@ -1610,38 +1616,20 @@ IMPOSSIBLE = {
 }
 
 
-@cache
-def resolved(name: str) -> dict[str, Any]:
-    with hydra.initialize_config_dir(str(EXAMPLES), version_base="1.3"):
-        return OmegaConf.to_container(hydra.compose(name), resolve=True)
-
-
-def options(node: dict[str, Any], prefix: str = "") -> Iterator[str]:
-    for name, setting in node.items():
-        if isinstance(setting, dict):
-            yield from options(setting, f"{prefix}{name}.")
-        else:
-            yield prefix + name
-
-
 def refused(name: str, option: str, wrong: Any) -> str:
-    """The message that a configuration gets for one wrong option; it is left as it is."""
-    settings = copy.deepcopy(resolved(name))
-    *sections, last = option.split(".")
-    reduce(dict.__getitem__, sections, settings)[last] = wrong
-    cfg = OmegaConf.create(settings)
+    """The message for one wrong option."""
+    settings = KINDS[name]().model_dump()
+    *groups, last = option.split(".")
+    reduce(dict.__getitem__, groups, settings)[last] = wrong
     with pytest.raises(ValueError) as info:
-        config.check_config(cfg)
-    assert repr(OmegaConf.to_container(cfg)) == repr(settings)
+        KINDS[name](**settings)
     return str(info.value)
 
 
-@pytest.mark.parametrize("name", CONFIGS)
-def test_configurations(name):
-    """Each option of a file: an impossible value, another type, and another name."""
-    config.check_config(OmegaConf.create(resolved(name)))
-    own = OmegaConf.to_container(OmegaConf.load(EXAMPLES / f"{name}.yaml"))
-    for option in options({key: own[key] for key in own.keys() - {"defaults", "hydra"}}):
+@pytest.mark.parametrize("name", KINDS)
+def test_options(name):
+    """Each option of a method: an impossible value, another type, and another name."""
+    for option in (row.name for row in describe(KINDS[name])):
         wrong, allowed = IMPOSSIBLE[option]
         message = refused(name, option, wrong)
         assert message.startswith(f"{option} must be "), message

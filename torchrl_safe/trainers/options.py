@@ -127,14 +127,17 @@ class Env(Group):
         "robot",
         "what to train in: a robot of ours (robot), a Gymnasium environment (gym), a velocity task "
         "of ours (velocity), or module:function, which returns a TorchRL environment with a cost",
+        min_length=1,
         fixed=True,
     )
     robot: str = option("point", "of env=robot", choices=ROBOTS, fixed=True)
     task: str | None = option(
         None, "of env=robot: another task than the robot's own", choices=TASKS, fixed=True
     )
-    id: str | None = option(None, "of env=gym: the environment's; of env=velocity: the task's")
-    cost: str | None = option(None, "of env=gym: module:function, the cost of a step")
+    id: str | None = option(
+        None, "of env=gym: the environment's; of env=velocity: the task's", min_length=1
+    )
+    cost: str | None = option(None, "of env=gym: module:function, the cost of a step", min_length=1)
     num_envs: int = option(
         400,
         "environments side by side; many short episodes: the safety critic generalises by the "
@@ -365,7 +368,7 @@ class Options(Group):
         try:
             super().__init__(**values)
         except ValidationError as error:
-            raise ValueError(_message(type(self), error)) from None
+            raise ValueError(_message(type(self), error, values)) from None
 
     @classmethod
     def of(cls, **named: Any) -> Self:
@@ -726,7 +729,7 @@ def _allowed(field: FieldInfo) -> str:
     return f"{nothing}a name"
 
 
-def _message(options: type[Options], error: ValidationError) -> str:
+def _message(options: type[Options], error: ValidationError, values: Mapping[str, Any]) -> str:
     """The first mistake, with the option's dotted name and what is allowed."""
     first = error.errors()[0]
     field: Any = None
@@ -746,7 +749,7 @@ def _message(options: type[Options], error: ValidationError) -> str:
     if isinstance(group, type) and issubclass(group, Group):
         return f"{name} must be a group of options, got {value!r}."
     if len(first["loc"]) > len(names):  # of an entry: show all of it
-        value = first["input"]
+        value = _look_up(values, name, value)
     return f"{name} must be {_allowed(field)}, got {_shown(value)}."
 
 

@@ -11,7 +11,7 @@ from torchrl.envs import GymWrapper, ParallelEnv, RenameTransform, SerialEnv
 from torchrl.envs.utils import ExplorationType
 
 from torchrl_safe.envs import cost_from_info
-from torchrl_safe.record import batch_metrics, evaluate, summarize
+from torchrl_safe.record import batch_metrics, describe, evaluate, summarize
 
 
 class TestForeignEnvironments:
@@ -61,10 +61,21 @@ class TestForeignEnvironments:
 
     def test_several_costs(self):
         env = self.make({"count": "cost", "speed": "speed"}, violation_above=3.0)
-        with pytest.raises(KeyError, match=r"cost.* is missing; .*count_cost.*speed_cost"):
-            batch_metrics(env.rollout(2))
-        with pytest.raises(KeyError, match=r"violation.* is missing; .*count_violation"):
-            self.judge(env)
+        metrics = batch_metrics(env.rollout(4))
+        assert metrics["train/count_cost_rate"] == 10.0 / 4
+        assert "train/cost_rate" not in metrics
+        episode = self.judge(env)
+        assert episode["count_cost"] == 10.0
+        assert episode["count_cost_rate"] == 10.0 / 4
+        discounted = sum(0.99**step * (step + 1) for step in range(4))
+        assert episode["discounted_count_cost"] == pytest.approx(discounted)
+        assert describe(episode)[0]["count_cost"] == 10.0
+        flags = env.rollout(4)["next"]  # of an episode like the judged one
+        either = flags["count_violation"] | flags["speed_violation"]
+        assert episode["violations"] == either.sum()
+
+    def test_one_of_several_costs(self):
+        env = self.make({"count": "cost", "speed": "speed"}, violation_above=3.0)
         names = ["count_cost", "count_violation"], ["cost", "violation"]
         env.append_transform(RenameTransform(*names))
         episode = self.judge(env)

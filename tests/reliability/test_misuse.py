@@ -1528,6 +1528,7 @@ IMPOSSIBLE = {
     "resume": (1, "one of True, False"),
     "update": ("newton", "'trust_region', 'lagrangian', 'pid'"),
     "env.name": ("", "a name"),
+    "env.task": ("chess", "null or one of"),
     "env.id": ("", "null or a name"),
     "env.cost": ("", "null or a name"),
     "env.robot": ("unicycle", "'point'"),

@@ -23,6 +23,8 @@ from torch import Tensor
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
+from torchrl_safe._costs import costs_among, violation_key
+
 __all__ = [
     "batch_metrics",
     "bootstrap_interval",
@@ -158,7 +160,8 @@ def evaluate(
     Args:
         env (EnvBase): batch size [\*N], with leaves of shape [\*N, 1] ``("next", "reward")``,
             ``("next", "cost")``, ``("next", "violation")`` or ``("next", "violations")``, and
-            ``("next", "goal_met")`` if there are goals. Of several costs, rename one to ``"cost"``.
+            ``("next", "goal_met")`` if there are goals. Of several costs, each has a leaf
+            ``("next", "<name>_cost")``.
         policy (callable): from tensordict to tensordict with the action. Put a policy with
             dropout or the like in ``eval()`` mode first.
 
@@ -173,9 +176,10 @@ def evaluate(
     Returns:
         TensorDict: batch size [\*N], per episode. In float64: ``episode_return``, ``violations``
         (steps), ``entries`` (violating steps after one that was none, or at the start), ``cv_rate``
-        and ``cost_rate`` (per step), ``cost`` and ``discounted_cost`` (sums), ``score``, ``goals``
-        (steps that met one), ``length`` (steps taken). In bool, how it ended: ``terminated``,
-        ``truncated``, or neither if ``num_steps`` were over first.
+        and ``cost_rate`` (per step), ``cost`` and ``discounted_cost`` (sums; of several costs
+        ``speed_cost``, ``discounted_speed_cost``, ``speed_cost_rate`` and so on), ``score``,
+        ``goals`` (steps that met one), ``length`` (steps taken). In bool, how it ended:
+        ``terminated``, ``truncated``, or neither if ``num_steps`` were over first.
 
     Raises:
         ValueError: if ``num_steps`` is not positive, ``cost_gamma`` is not in [0, 1], or a leaf has
@@ -198,9 +202,11 @@ def evaluate(
         raise ValueError(f"num_steps must be at least 1, got {num_steps}.")
     if not 0.0 <= cost_gamma <= 1.0:
         raise ValueError(f"cost_gamma must be in [0, 1], got {cost_gamma}.")
+    costs = costs_among(env.full_reward_spec.keys()) or ("cost",)
     names = (
-        *("reward", "cost", "discounted_cost", "violations", "entries", "goal_met"),
-        *("length", "duration"),
+        *("reward", "violations", "entries", "goal_met", "length", "duration"),
+        *costs,
+        *(f"discounted_{cost}" for cost in costs),
     )
     zero = torch.zeros(env.batch_size, dtype=torch.float64, device=env.device)
     total = {name: zero.clone() for name in names}
@@ -216,10 +222,11 @@ def evaluate(
         for step in range(num_steps):
             stepped, td = env.step_and_maybe_reset(policy(td))
             violations = _violations(stepped)
-            for name in ("reward", "cost", "goal_met"):
+            for name in ("reward", "goal_met", *costs):
                 total[name] += _signal(stepped, ("next", name)).double().where(running, 0.0)
-            cost = _signal(stepped, ("next", "cost")).double()
-            total["discounted_cost"] += (cost_gamma**step * cost).where(running, 0.0)
+            for name in costs:
+                cost = cost_gamma**step * _signal(stepped, ("next", name)).double()
+                total[f"discounted_{name}"] += cost.where(running, 0.0)
             total["violations"] += violations.where(running, 0.0)
             total["entries"] += running & (violations > 0) & ~violated
             violated = violations > 0
@@ -237,9 +244,8 @@ def evaluate(
             "entries": total["entries"],
             "cv_rate": total["violations"] / total["duration"],
             "score": score(total["reward"], total["violations"]),
-            "cost": total["cost"],
-            "discounted_cost": total["discounted_cost"],
-            "cost_rate": total["cost"] / total["duration"],
+            **{name: total[name] for cost in costs for name in (cost, f"discounted_{cost}")},
+            **{f"{cost}_rate": total[cost] / total["duration"] for cost in costs},
             "goals": total["goal_met"],
             "length": total["length"],
             **ends,
@@ -302,9 +308,11 @@ def describe(episodes: TensorDictBase) -> list[dict[str, float | int | str]]:
         [(5, 'running'), (5, 'running')]
     """
     episodes = episodes.flatten()
+    costs = costs_among(name for name in episodes.keys() if not name.startswith("discounted_"))
+    sums = [name for cost in costs for name in (cost, f"discounted_{cost}")]
     columns = {
         "return": episodes["episode_return"].tolist(),
-        **{name: episodes[name].tolist() for name in ("score", "cost", "discounted_cost")},
+        **{name: episodes[name].tolist() for name in ("score", *sums)},
         **{
             name: episodes[name].long().tolist()
             for name in ("violations", "entries", "goals", "length")
@@ -374,13 +382,14 @@ def batch_metrics(td: TensorDictBase, prefix: str = "train/") -> dict[str, float
     """
     if not td.batch_size.numel():
         raise ValueError(f"td must hold at least one step, got batch size {tuple(td.batch_size)}.")
-    signals = [_signal(td, ("next", name)).double() for name in ("reward", "cost")]
+    costs = costs_among(td["next"].keys()) or ("cost",)
+    signals = [_signal(td, ("next", name)).double() for name in ("reward", *costs)]
     violations = _violations(td)
     sums = torch.stack([signal.sum() for signal in (*signals, violations)])
-    reward, cost, violation = (sums / violations.clamp(min=1.0).sum()).tolist()
+    reward, *rates, violation = (sums / violations.clamp(min=1.0).sum()).tolist()
     return {
         f"{prefix}reward_per_1000": 1_000 * reward,
-        f"{prefix}cost_rate": cost,
+        **{f"{prefix}{cost}_rate": rate for cost, rate in zip(costs, rates, strict=True)},
         f"{prefix}cv_rate": violation,
     }
 
@@ -411,9 +420,18 @@ def acting(exploration_type: ExplorationType) -> Iterator[None]:
 
 
 def _violations(td: TensorDictBase) -> Tensor:
-    """How many violating steps each step counts for, [*B], float64."""
-    name = "violations" if ("next", "violations") in td.keys(True) else "violation"
-    return _signal(td, ("next", name)).double()
+    """How many violating steps each step counts for, [*B], float64.
+
+    Of several costs without a flag for all of them, a step violates if one of their own is set.
+    """
+    names = set(td["next"].keys()) if "next" in td.keys() else set()
+    flags = [violation_key(cost) for cost in costs_among(names)]
+    if "violations" in names:
+        flags = ["violations"]
+    elif "violation" in names or not flags:
+        flags = ["violation"]
+    signals = [_signal(td, ("next", flag)).double() for flag in flags]
+    return signals[0] if len(signals) == 1 else torch.stack(signals).amax(0)
 
 
 def _signal(td: TensorDictBase, key: NestedKey) -> Tensor:

@@ -1,7 +1,18 @@
-"""``torchrl-safe train METHOD``: a method with options of the command line, by hydra's grammar."""
+"""The command ``torchrl-safe``: train a method, or do something with a run.
+
+    torchrl-safe train safetac env.robot=point
+    torchrl-safe train cpo env=gym env.id=Pendulum-v1 env.cost=my_costs:speed
+    torchrl-safe train trc --multirun seed=0,1,2
+    torchrl-safe evaluate runs/safetac/point/seed_0
+    torchrl-safe play safetac-point
+
+Options of training are hydra's grammar; the other commands have ``--help``.
+"""
 
 from __future__ import annotations
 
+import argparse
+import os
 import re
 import sys
 from collections.abc import Callable, Sequence
@@ -12,7 +23,9 @@ from hydra.core.config_store import ConfigStore
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import DictConfig, OmegaConf
+from torchrl.checkpoint import CheckpointError
 
+from torchrl_safe.trainers.commands import evaluate, export, play, watch
 from torchrl_safe.trainers.methods import METHODS
 from torchrl_safe.trainers.options import Options, flat
 
@@ -25,6 +38,47 @@ HYDRA = {
         "subdir": ".",
     },
 }
+
+
+COMMANDS: dict[str, Any] = {
+    module.__name__.rpartition(".")[2]: module for module in (evaluate, watch, export, play)
+}
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Do what the command line says.
+
+    Args:
+        arguments (sequence of str, optional): defaults to the process's.
+
+    Raises:
+        SystemExit: if it cannot be done, with the reason.
+    """
+    parser = argparse.ArgumentParser(
+        "torchrl-safe",
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    commands = parser.add_subparsers(dest="command", required=True)
+    trains = commands.add_parser("train", help="train a method")
+    trains.add_argument("method", choices=METHODS)
+    trains.add_argument(
+        "options", nargs=argparse.REMAINDER, help="such as loss.cost_limit=2.5, --multirun, --help"
+    )
+    for name, module in COMMANDS.items():
+        summary = module.__doc__.splitlines()[0]
+        module.add_arguments(commands.add_parser(name, help=summary, description=summary))
+    given = vars(parser.parse_args(arguments))
+    # Where module:function is looked for; last, so that nothing there passes for Python's own.
+    sys.path.append(os.getcwd())
+    command = given.pop("command")
+    if command == "train":
+        train(given["method"], given["options"])
+        return
+    try:
+        COMMANDS[command].main(**given)
+    except (CheckpointError, ModuleNotFoundError, OSError, ValueError) as error:
+        sys.exit(f"torchrl-safe {command}: {error}")
 
 
 def train(method: str, arguments: Sequence[str] | None = None, **defaults: Any) -> None:
@@ -131,3 +185,7 @@ def _leaves(values: Any, standard: Any, prefix: str = "") -> list[tuple[str, Any
         else:
             leaves.append((full, value))
     return leaves
+
+
+if __name__ == "__main__":
+    main()

@@ -22,6 +22,7 @@ from torchrl.envs import (
 )
 from torchrl.envs.batched_envs import BatchedEnvBase
 
+from torchrl_safe._costs import violation_key
 from torchrl_safe.envs import RANDOMIZATIONS
 from torchrl_safe.trainers.options import MethodOptions
 
@@ -77,7 +78,7 @@ def make_env(
     if source is not None:
         return _completed(_batched(source, num_envs, seed), options)
     if name == "robot":
-        from torchrl_safe.envs import SafeGoalEnv
+        from torchrl_safe.envs import SafeRobotEnv
 
         if training:
             of_robots = {
@@ -86,8 +87,9 @@ def make_env(
                 "randomization": RANDOMIZATIONS.get(options.env.randomization or ""),
                 **of_robots,
             }
-        return SafeGoalEnv(
+        return SafeRobotEnv(
             options.env.robot,
+            task=options.env.task,
             num_envs=num_envs,
             num_threads=options.num_threads,
             seed=seed,
@@ -243,7 +245,8 @@ def _completed(env: EnvBase, options: MethodOptions) -> EnvBase:
     if "observation" not in observations.keys() and vectors:
         together = CatTensors(in_keys=vectors, out_key="observation", del_keys=False)
         env = TransformedEnv(env, together)
-    if "violation" not in observations.keys():
+    flags = {violation_key(cost) for cost in costs}
+    if not {"violation", *flags} & set(observations.keys()):
         env = TransformedEnv(env, _ViolationOfCosts(costs))
     return env
 

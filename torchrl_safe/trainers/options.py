@@ -31,6 +31,7 @@ from torch import nn
 from typing_extensions import Self
 
 from torchrl_safe.envs import RANDOMIZATIONS, ROBOTS
+from torchrl_safe.envs.tasks import TASKS
 
 MOST = 2**31 - 1  # what C's int holds
 FRAMES = 2**63 - 1  # what a counter of frames holds
@@ -130,6 +131,9 @@ class Env(Group):
         fixed=True,
     )
     robot: str = option("point", "of env=robot", choices=ROBOTS, fixed=True)
+    task: str | None = option(
+        None, "of env=robot: another task than the robot's own", choices=TASKS, fixed=True
+    )
     id: str | None = option(
         None, "of env=gym: the environment's; of env=velocity: the task's", min_length=1
     )

@@ -26,10 +26,12 @@ from torchrl_safe.record import batch_metrics, count_violations
 from torchrl_safe.trainers.collectors import WorkerDied, make_collector
 from torchrl_safe.trainers.environments import cost_names, has_state, make_env, source_of
 from torchrl_safe.trainers.networks import MakeNetwork, is_discrete, make_critic, make_policy
-from torchrl_safe.trainers.options import ConstrainedLoss, MethodOptions
+from torchrl_safe.trainers.options import ConstrainedLoss, MethodOptions, flat
 from torchrl_safe.trainers.run import Run
 from torchrl_safe.trainers.streams import stream_seed
 from torchrl_safe.trainers.terminal import GracefulStop, progress_bar, say
+
+WIDTHS = ("env.num_envs", "eval.num_episodes", "eval.final_episodes")  # of batches
 
 
 class Trainer(ABC):
@@ -69,6 +71,7 @@ class Trainer(ABC):
         **named: Any,
     ) -> None:
         self.source: Callable[..., EnvBase] | None = None
+        width = None
         if isinstance(env, str):
             if env not in ROBOTS:
                 raise ValueError(
@@ -80,10 +83,10 @@ class Trainer(ABC):
             self.source, width = source_of(env)
             named.setdefault("env.name", "python")
             if width is not None:
-                for name in ("env.num_envs", "eval.num_episodes", "eval.final_episodes"):
-                    named[name] = width
+                named = dict.fromkeys(WIDTHS, width) | named
         options = self.Options() if options is None else options
         self.options: Any = options.changed(**named)
+        self._width = width
         self.in_keys = list(in_keys)
         self.network = network
         self.run: Run | None = None
@@ -155,7 +158,15 @@ class Trainer(ABC):
                 not set.
             FileNotFoundError: if there is nothing to resume.
         """
-        with Run(self.options.changed(**named)) as run:
+        options: Any = self.options.changed(**named)
+        values = dict(flat(options))
+        for name in WIDTHS if self._width is not None else ():
+            if values[name] != self._width:
+                raise ValueError(
+                    f"{name} must be {self._width}, the batch of env, got {values[name]}; a "
+                    "function that makes environments of num_envs and seed can have any."
+                )
+        with Run(options) as run:
             self.run, self.options = run, run.options
             set_up(self.options)
             eval_env = self.make_env(self.options.eval.num_episodes, stream_seed("evaluation"))
@@ -238,7 +249,7 @@ class Trainer(ABC):
             progress.update(batch.numel())
             progress.set_postfix(
                 reward=f"{metrics['train/reward_per_1000']:.1f}",
-                cost=f"{metrics['train/cost_rate']:.3f}",
+                cost=" ".join(f"{x:.3f}" for n, x in metrics.items() if is_cost_rate(n)),
                 cv=f"{metrics['train/cv_rate']:.4f}",
                 kl=f"{metrics.get('update/kl', 0.0):.4f}",
             )
@@ -312,6 +323,11 @@ class ConstrainedTrainer(Trainer):
     def name_of(self, name: str, cost: str) -> str:
         """The name of something that each cost has, told apart where there are several."""
         return name if len(self.costs) == 1 else f"{name}/{cost}"
+
+
+def is_cost_rate(metric: str) -> bool:
+    """Whether a metric is a cost per step of training."""
+    return metric.startswith("train/") and metric.endswith("cost_rate")
 
 
 def limit_at(loss: ConstrainedLoss, cost: str, frames: int) -> float:

@@ -13,15 +13,13 @@ from pathlib import Path
 import hydra
 import numpy as np
 import pytest
-import safetac_point
 import torch
 from omegaconf import OmegaConf
 
-from torchrl_safe import record, trainers
-from torchrl_safe.trainers import logs, utils
+from torchrl_safe import record
+from torchrl_safe.trainers import SafeTAC, cli, logs, trainer
 
-EXAMPLES = Path(safetac_point.__file__).parent
-CONFIGS = Path(trainers.__file__).parent
+EXAMPLES = Path(__file__).parents[2] / "examples"
 TINY = [
     "num_threads=1",
     "env.num_envs=20",
@@ -42,9 +40,8 @@ TINY = [
 
 
 def launch(run_dir: Path, *overrides: str) -> None:
-    with hydra.initialize_config_dir(str(CONFIGS), version_base="1.3"):
-        cfg = hydra.compose("safetac_point", [f"run_dir={run_dir}", *TINY, *overrides])
-    safetac_point.main.__wrapped__(cfg)
+    options = cli.compose("safetac", [f"run_dir={run_dir}", *TINY, *overrides])
+    SafeTAC(options=options).train()
 
 
 @pytest.fixture(scope="module")
@@ -66,7 +63,7 @@ def interrupted(monkeypatch):
                 signal.raise_signal(number)
             return record.count_violations(batch)
 
-        monkeypatch.setattr(utils, "count_violations", count_violations)
+        monkeypatch.setattr(trainer, "count_violations", count_violations)
 
     return interrupt
 
@@ -94,7 +91,7 @@ class TestRun:
             "train/reward_per_1000",
             "train/cost_rate",
             "train/entropy",
-            "update/constraint",
+            "update/cost_level",
             "update/kl",
             "update/case_code",
             "update/loss_cost_value",

@@ -1,23 +1,19 @@
-"""The scripts of the baselines and the ablations, from the configuration to the results."""
+"""The baselines and the ablations, from the options to the results."""
 
 from __future__ import annotations
 
-import importlib
 import json
 import math
 from pathlib import Path
 
-import evaluate
-import hydra
 import pytest
 import torch
-import watch
 from tensordict import TensorDict
 
 from torchrl_safe import record
-from torchrl_safe.trainers import utils
+from torchrl_safe.trainers import METHODS, cli, load_policy
+from torchrl_safe.trainers.commands import evaluate, watch
 
-EXAMPLES = Path(utils.__file__).parent
 TINY = [
     "num_threads=1",
     "env.num_envs=20",
@@ -37,7 +33,7 @@ GRADIENT = ["replay_buffer.size=5000", "optim.num_updates=2", "optim.minibatch_s
 SURROGATE = ["optim.critic_rounds=1", "optim.minibatch_size=200"]
 REPLAY = ["replay_buffer.size=5000", "optim.critic_frames=400", "optim.policy_frames=400"]
 
-METHODS = {
+CASES = {
     "tac": ("tac", GRADIENT, {"update/loss_qvalue", "update/alpha"}),
     "wcsac": ("wcsac", GRADIENT, {"update/loss_cost_std", "update/multiplier"}),
     "sac_lagrangian": ("sac_lagrangian", GRADIENT, {"update/loss_actor", "update/multiplier"}),
@@ -45,12 +41,12 @@ METHODS = {
     "trc": ("trc", SURROGATE, {"update/kl", "update/loss_cost_variance"}),
     "offpolicy_trc": ("offpolicy_trc", [*SURROGATE, *REPLAY], {"update/kl", "update/loss_value"}),
     "safetac_lagrangian": (
-        "safetac_point",
+        "safetac",
         ["update=lagrangian", *SURROGATE, *REPLAY],
         {"update/multiplier", "update/loss_cost_std"},
     ),
     "safetac_pid": (
-        "safetac_point",
+        "safetac",
         ["update=pid", *SURROGATE, *REPLAY],
         {"update/multiplier", "update/loss_cost_std"},
     ),
@@ -58,15 +54,14 @@ METHODS = {
 
 
 def launch(name: str, run_dir: Path, *overrides: str) -> None:
-    with hydra.initialize_config_dir(str(EXAMPLES), version_base="1.3"):
-        cfg = hydra.compose(name, [f"run_dir={run_dir}", *TINY, *overrides])
-    importlib.import_module(name).main.__wrapped__(cfg)
+    options = cli.compose(name, [f"run_dir={run_dir}", *TINY, *overrides])
+    METHODS[name](options=options).train()
 
 
-@pytest.mark.parametrize("method", sorted(METHODS.keys() - {"cpo", "sac_lagrangian"}))
+@pytest.mark.parametrize("method", sorted(CASES.keys() - {"cpo", "sac_lagrangian"}))
 def test_resumes_exactly(tmp_path, method):
     """Two halves are one run: multipliers and target networks are in a checkpoint, too."""
-    script, overrides, logged = METHODS[method]
+    script, overrides, logged = CASES[method]
     whole, halves = tmp_path / "whole", tmp_path / "halves"
     launch(script, whole, *overrides, "collector.total_frames=1600")
     launch(script, halves, *overrides, "collector.total_frames=800")
@@ -87,10 +82,10 @@ def test_resumes_exactly(tmp_path, method):
 
 @pytest.mark.parametrize("method", ["sac_lagrangian", "cpo"])
 def test_policy_can_be_loaded(tmp_path, method):
-    script, overrides, logged = METHODS[method]
+    script, overrides, logged = CASES[method]
     launch(script, tmp_path / "run", *overrides, "collector.total_frames=800")
     assert logged <= record.read_metrics(tmp_path / "run" / "log").keys()
-    policy = utils.load_policy(tmp_path / "run")
+    policy = load_policy(tmp_path / "run")
     states = TensorDict({"observation": torch.randn(3, 24)}, [3])
     assert policy(states)["action"].shape == (3, 2)
 
@@ -98,7 +93,7 @@ def test_policy_can_be_loaded(tmp_path, method):
 @pytest.mark.parametrize("method", ["tac", "wcsac", "trc"])
 def test_run_can_be_watched_and_evaluated(tmp_path, method, capsys):
     """No method logs all that SafeTAC does: the tools show what there is."""
-    script, overrides, _ = METHODS[method]
+    script, overrides, _ = CASES[method]
     launch(script, tmp_path / "run", *overrides, "collector.total_frames=800")
     watch.main(tmp_path / "run", every=1.0, once=True)
     assert "800 of 800" in capsys.readouterr().out
@@ -110,7 +105,7 @@ def test_run_can_be_watched_and_evaluated(tmp_path, method, capsys):
 
 @pytest.mark.parametrize("method", ["trc", "safetac_pid"])
 def test_limit_falls_as_configured(tmp_path, method):
-    script, overrides, _ = METHODS[method]
+    script, overrides, _ = CASES[method]
     schedule = ["loss.initial_cost_limit=9.0", "loss.cost_limit=5.0", "loss.anneal_frames=800"]
     launch(script, tmp_path / "run", *overrides, *schedule, "collector.total_frames=1200")
     frames, limits = record.read_metrics(tmp_path / "run" / "log")["update/cost_limit"]
@@ -124,9 +119,9 @@ def test_update_chooses_how_the_policy_moves(tmp_path):
     overrides = [*SURROGATE, *REPLAY, *violated, "collector.total_frames=800"]
     curves = {}
     for update in ("trust_region", "lagrangian", "pid"):
-        launch("safetac_point", tmp_path / update, f"update={update}", *overrides)
+        launch("safetac", tmp_path / update, f"update={update}", *overrides)
         curves[update] = record.read_metrics(tmp_path / update / "log")
-    launch("safetac_point", tmp_path / "default", *overrides)
+    launch("safetac", tmp_path / "default", *overrides)
     default = record.read_metrics(tmp_path / "default" / "log")
     assert default["update/kl"][1].tolist() == curves["trust_region"]["update/kl"][1].tolist()
     assert (default["update/kl"][1] > 0).all()
@@ -138,7 +133,7 @@ def test_update_chooses_how_the_policy_moves(tmp_path):
         return curves[update]["update/multiplier"][1].tolist()
 
     assert multipliers("lagrangian") != multipliers("pid")
-    violation = curves["pid"]["update/constraint"][1][0]
+    violation = curves["pid"]["update/cost_level"][1][0]
     assert violation > 0
     # kp c + ki (init / ki + c), with the gains of the configuration.
     assert multipliers("pid")[0] == pytest.approx(0.1 + 0.06 * violation, rel=1e-4)
@@ -147,5 +142,5 @@ def test_update_chooses_how_the_policy_moves(tmp_path):
 @pytest.mark.parametrize(("kind", "name"), [("pid", "pid.ki"), ("lagrangian", "lagrangian.init")])
 def test_impossible_gain(tmp_path, kind, name):
     with pytest.raises(ValueError, match=f"{name} must be a number"):
-        launch("safetac_point", tmp_path / "run", f"update={kind}", f"{name}=-1")
+        launch("safetac", tmp_path / "run", f"update={kind}", f"{name}=-1")
     assert not (tmp_path / "run").exists()

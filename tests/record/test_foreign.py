@@ -11,7 +11,7 @@ from torchrl.envs import GymWrapper, ParallelEnv, RenameTransform, SerialEnv
 from torchrl.envs.utils import ExplorationType
 
 from torchrl_safe.envs import cost_from_info
-from torchrl_safe.record import batch_metrics, evaluate, summarize
+from torchrl_safe.record import batch_metrics, describe, evaluate, summarize
 
 
 class TestForeignEnvironments:
@@ -46,7 +46,8 @@ class TestForeignEnvironments:
         assert episode["episode_return"] == 8.0
         assert episode["violations"] == 2.0  # of 1, 2, 3, 4
         assert episode["cost_rate"] == 10.0 / 4
-        assert episode["goals"] == 0.0
+        assert "goals" not in episode.keys()
+        assert "goals" not in describe(episode)[0]
         assert summarize(episode)["eval/score"] == pytest.approx(8.0 / 3)
         metrics = batch_metrics(env.rollout(4))
         assert metrics == pytest.approx(
@@ -61,10 +62,23 @@ class TestForeignEnvironments:
 
     def test_several_costs(self):
         env = self.make({"count": "cost", "speed": "speed"}, violation_above=3.0)
-        with pytest.raises(KeyError, match=r"cost.* is missing; .*count_cost.*speed_cost"):
-            batch_metrics(env.rollout(2))
-        with pytest.raises(KeyError, match=r"violation.* is missing; .*count_violation"):
-            self.judge(env)
+        episode = self.judge(env)
+        assert "cost" not in episode.keys()
+        assert episode["count_cost"] == 10.0
+        assert episode["count_discounted_cost"] == pytest.approx(
+            1 + 2 * 0.99 + 3 * 0.99**2 + 4 * 0.99**3
+        )
+        assert episode["count_violations"] == 1.0  # 4 is above 3
+        assert episode["count_cv_rate"] == 0.25
+        steps = env.rollout(4)["next"]
+        assert episode["speed_cost"] == steps["speed_cost"].sum()
+        either = steps["count_violation"] | steps["speed_violation"]
+        assert episode["violations"] == either.sum()
+        metrics = batch_metrics(env.rollout(4))
+        assert metrics["train/count_cost_rate"] == 2.5
+        assert metrics["train/speed_cv_rate"] == steps["speed_violation"].float().mean()
+        assert metrics["train/cv_rate"] == either.float().mean()
+        assert summarize(episode)["eval/count_cost"] == describe(episode)[0]["count_cost"] == 10.0
         names = ["count_cost", "count_violation"], ["cost", "violation"]
         env.append_transform(RenameTransform(*names))
         episode = self.judge(env)

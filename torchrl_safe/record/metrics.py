@@ -190,8 +190,8 @@ def evaluate(
 
     Examples:
         >>> from torchrl.envs.utils import ExplorationType
-        >>> from torchrl_safe.envs import SafeGoalEnv
-        >>> env = SafeGoalEnv("point", num_envs=2, num_threads=1)
+        >>> from torchrl_safe.envs import SafeRobotEnv
+        >>> env = SafeRobotEnv("point", num_envs=2, num_threads=1)
         >>> episodes = evaluate(
         ...     env, env.rand_action, num_steps=5, exploration_type=ExplorationType.RANDOM, seed=0
         ... )
@@ -305,8 +305,8 @@ def describe(episodes: TensorDictBase) -> list[dict[str, float | int | str]]:
 
     Examples:
         >>> from torchrl.envs.utils import ExplorationType
-        >>> from torchrl_safe.envs import SafeGoalEnv
-        >>> env = SafeGoalEnv("point", num_envs=2, num_threads=1)
+        >>> from torchrl_safe.envs import SafeRobotEnv
+        >>> env = SafeRobotEnv("point", num_envs=2, num_threads=1)
         >>> episodes = evaluate(
         ...     env, env.rand_action, num_steps=5, exploration_type=ExplorationType.RANDOM, seed=0
         ... )

@@ -68,8 +68,8 @@ def record_video(
         RuntimeError: if the environment cannot render here, for example without OpenGL.
 
     Examples:
-        >>> from torchrl_safe.envs import SafeGoalEnv
-        >>> env = SafeGoalEnv("point", num_envs=1, num_threads=1)
+        >>> from torchrl_safe.envs import SafeRobotEnv
+        >>> env = SafeRobotEnv("point", num_envs=1, num_threads=1)
         >>> # Needs OpenGL, so it is not run as a test.
         >>> record_video(env, env.rand_action, "point.mp4")  # doctest: +SKIP
         PosixPath('point.mp4')

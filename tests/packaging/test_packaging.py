@@ -154,7 +154,7 @@ class TestBuilt:
     def test_sdist_is_whole(self, built):
         source, _ = built
         for name in [
-            "tests/conftest.py",
+            "conftest.py",
             "docs/index.md",
             "docs/images/curves.png",
             "examples/safetac_point.py",

@@ -143,7 +143,7 @@ def built(tmp_path_factory) -> tuple[Path, Path]:
     python(build % "build_sdist", cwd=folder / "clone")
     (sdist,) = folder.glob("*.tar.gz")
     with tarfile.open(sdist) as archive:
-        archive.extractall(folder)
+        archive.extractall(folder, filter="data")
     source = folder / sdist.name.removesuffix(".tar.gz")
     python(build % "build_wheel", cwd=source)
     (wheel,) = folder.glob("*.whl")

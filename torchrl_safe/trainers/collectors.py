@@ -115,11 +115,14 @@ class ResumableCollector(Collector):
         self._traj_pool.load_state_dict(state_dict["collector"]["traj_pool"])
 
 
+_Collector: Any = object  # one of several processes, whose methods these are
+
+
 class WorkerDied(RuntimeError):
     """A process that collects has ended; the message says which one, and what to do."""
 
 
-class _Watched:
+class _Watched(_Collector):
     """A collector of several processes that says which of them has died."""
 
     def iterator(self) -> Iterator[TensorDictBase]:

@@ -103,9 +103,12 @@ def make_env(
     if name == "velocity":
         from torchrl_safe.envs import SafeVelocityEnv
 
-        how = {"episode_length": options.env.episode_length, "stagger": True} if training else {}
+        how: dict[str, Any] = (
+            {"episode_length": options.env.episode_length, "stagger": True} if training else {}
+        )
+        task: Any = options.env.id
         return SafeVelocityEnv(
-            options.env.id,
+            task,
             num_envs=num_envs,
             num_threads=options.num_threads,
             seed=seed,

@@ -236,7 +236,9 @@ class CriticFit:
             # Sizes that come up are few: the last minibatch is smaller than the others. Nothing
             # sets an attribute of the losses from here on; to look at all of them, every time,
             # costs a tenth of a gradient step.
-            unguarded = {"guard_filter_fn": torch.compiler.skip_guard_on_all_nn_modules_unsafe}
+            unguarded: dict[str, Any] = {
+                "guard_filter_fn": torch.compiler.skip_guard_on_all_nn_modules_unsafe
+            }
             targets_of, losses_of = (
                 torch.compile(function, dynamic=False, options=unguarded)
                 for function in (targets_of, losses_of)

@@ -11,7 +11,7 @@ from torchrl.envs import EnvBase
 
 from torchrl_safe.trainers.off_policy import make_slice_buffer, replayed
 from torchrl_safe.trainers.on_policy import SurrogateOptim, SurrogateOptions, SurrogateTrainer
-from torchrl_safe.trainers.options import Collector, SliceBuffer, again, option
+from torchrl_safe.trainers.options import SliceBuffer, again, option
 
 
 class OffPolicyTRCBuffer(SliceBuffer):
@@ -34,7 +34,6 @@ class OffPolicyTRCOptions(SurrogateOptions):
 
     method: ClassVar[str] = "offpolicy_trc"
 
-    collector: Collector = Field(default_factory=Collector)
     replay_buffer: OffPolicyTRCBuffer = Field(default_factory=OffPolicyTRCBuffer)
     optim: OffPolicyTRCOptim = Field(default_factory=OffPolicyTRCOptim)
 

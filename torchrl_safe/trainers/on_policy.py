@@ -17,7 +17,6 @@ from torchrl_safe.optim import FiniteSteps
 from torchrl_safe.trainers.networks import is_discrete
 from torchrl_safe.trainers.off_policy import as_components, minibatches
 from torchrl_safe.trainers.options import (
-    Collector,
     ConstrainedLoss,
     MethodOptions,
     TrustRegion,
@@ -26,17 +25,6 @@ from torchrl_safe.trainers.options import (
 )
 from torchrl_safe.trainers.policy_steps import make_trust_region
 from torchrl_safe.trainers.trainer import ConstrainedTrainer
-
-
-class SurrogateCollector(Collector):
-    """Who acts, and for how long."""
-
-    frames_per_batch: int = again(
-        Collector,
-        "frames_per_batch",
-        20_000,
-        meaning="frames per update: a step fits the noise of fewer",
-    )
 
 
 class SurrogateLoss(ConstrainedLoss):
@@ -68,7 +56,6 @@ class SurrogateOptim(TrustRegion):
 class SurrogateOptions(MethodOptions):
     """What the options of these methods have."""
 
-    collector: SurrogateCollector = Field(default_factory=SurrogateCollector)
     loss: SurrogateLoss = Field(default_factory=SurrogateLoss)
     optim: SurrogateOptim = Field(default_factory=SurrogateOptim)
 

@@ -55,7 +55,7 @@ class Multiplier:
         self, num_constraints: int, lagrangian: Lagrangian, pid: PID | None, device: str
     ) -> None:
         self.module: LagrangeMultiplier | PIDMultiplier
-        self.optim: torch.optim.Optimizer | None = None
+        self.optim: Any = None  # of one that learns
         if pid is not None:
             self.module = PIDMultiplier(
                 num_constraints, kp=pid.kp, ki=pid.ki, kd=pid.kd, init=lagrangian.init
@@ -73,7 +73,7 @@ class Multiplier:
 
     def update(self, constraint: Tensor) -> None:
         """React to the measured constraints, ``[m]``."""
-        if isinstance(self.module, PIDMultiplier) or self.optim is None:
+        if isinstance(self.module, PIDMultiplier):
             self.module.update(constraint)
             return
         self.optim.zero_grad()

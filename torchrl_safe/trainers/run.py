@@ -88,7 +88,7 @@ class Run:
         self._saved: int | None = None  # frames of the newest checkpoint
         self._saved_options: Mapping[str, Any] | None = None
         self._lock: FolderLock | None = None
-        self._log: Log | None = None
+        self._log: Any = None  # open from restore to close
         self._without_curves = False
 
     def __enter__(self) -> Run:

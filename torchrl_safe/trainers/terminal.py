@@ -51,7 +51,7 @@ class Lenient:
 
 def say(text: str) -> None:
     """A line on the terminal, if there is one."""
-    print(text, file=Lenient(sys.stdout), flush=True)  # type: ignore[arg-type]
+    print(text, file=Lenient(sys.stdout), flush=True)
 
 
 def progress_bar(**options: Any) -> tqdm:

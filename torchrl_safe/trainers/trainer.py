@@ -14,7 +14,7 @@ from typing import Any, ClassVar
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictSequential
-from torch import nn
+from torch import Tensor, nn
 from torchrl._utils import logger as torchrl_logger
 from torchrl._utils import timeit
 from torchrl.collectors import BaseCollector
@@ -293,7 +293,7 @@ class ConstrainedTrainer(Trainer):
         loss, scale = self.options.loss, discounted_unit(self.options)
         return {name: scale * limit_at(loss, name, self.frames) for name in self.costs}
 
-    def levels(self, levels: Mapping[str, float]) -> dict[str, float]:
+    def levels(self, levels: Mapping[str, float | Tensor]) -> dict[str, float]:
         """Metrics of how high costs stand, and of the limits of now, in ``loss.limit_unit``.
 
         Args:
@@ -316,7 +316,7 @@ class ConstrainedTrainer(Trainer):
         plain = {n: x for n, x in numbers.items() if not excess.fullmatch(n)}
         return {**plain, **self.levels(levels)}
 
-    def named(self, metric: str, values: Mapping[str, float]) -> dict[str, float]:
+    def named(self, metric: str, values: Mapping[str, float | Tensor]) -> dict[str, float]:
         """A metric of every cost: under its plain name if there is one cost."""
         return {self.name_of(metric, cost): float(value) for cost, value in values.items()}
 

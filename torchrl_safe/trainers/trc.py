@@ -9,13 +9,26 @@ from tensordict import TensorDictBase
 from torchrl._utils import timeit
 
 from torchrl_safe.trainers.on_policy import SurrogateLoss, SurrogateOptions, SurrogateTrainer
-from torchrl_safe.trainers.options import again
+from torchrl_safe.trainers.options import Collector, MethodOptions, again
+
+
+class TRCCollector(Collector):
+    """Who acts, and for how long."""
+
+    frames_per_batch: int = again(
+        Collector,
+        "frames_per_batch",
+        20_000,
+        meaning="frames per update: a step fits the noise of fewer",
+    )
 
 
 class TRCOptions(SurrogateOptions):
     """The options of TRC."""
 
     method: ClassVar[str] = "trc"
+
+    collector: TRCCollector = Field(default_factory=TRCCollector)
 
 
 class TRC(SurrogateTrainer):
@@ -27,7 +40,7 @@ class TRC(SurrogateTrainer):
         >>> policy = trainer.train(total_frames=1_000_000)  # doctest: +SKIP
     """
 
-    Options = TRCOptions
+    Options: ClassVar[type[MethodOptions]] = TRCOptions
 
     def update(self, batch: TensorDictBase) -> dict[str, float]:
         """Critics on the new batch, then a trust-region step on it; then it is thrown away."""
@@ -45,7 +58,7 @@ class CPOLoss(SurrogateLoss):
     risk_level: float = again(SurrogateLoss, "risk_level", 1.0, meaning="1 is the expectation")
 
 
-class CPOOptions(SurrogateOptions):
+class CPOOptions(TRCOptions):
     """The options of CPO."""
 
     method: ClassVar[str] = "cpo"

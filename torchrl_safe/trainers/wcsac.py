@@ -63,7 +63,7 @@ class WCSAC(ConstrainedTrainer):
         >>> policy = trainer.train(total_frames=1_000_000)  # doctest: +SKIP
     """
 
-    Options = WCSACOptions
+    Options: ClassVar[type[MethodOptions]] = WCSACOptions
 
     def build(self, env: EnvBase) -> dict[str, Any]:
         """A policy, losses of reward and costs with target networks, and a multiplier."""

@@ -229,9 +229,7 @@ class TestOldNames:
     def test_suite(self, suite):
         self.test_module("suite", "load", suite.load)
         with pytest.warns(DeprecationWarning, match=r"it is .*\.interfaces\.suite\.load now"):
-            from torchrl_safe.envs import suite as old
-
-            assert old.load is suite.load
+            assert envs.suite.load is suite.load
 
     def test_from_the_package(self):
         with pytest.warns(DeprecationWarning, match=r"it is .*\.GymRobotVectorEnv now"):

@@ -228,8 +228,6 @@ class TestOldNames:
 
     def test_suite(self, suite):
         self.test_module("suite", "load", suite.load)
-        with pytest.warns(DeprecationWarning, match=r"it is .*\.interfaces\.suite\.load now"):
-            assert envs.suite.load is suite.load
 
     def test_from_the_package(self):
         with pytest.warns(DeprecationWarning, match=r"it is .*\.GymRobotVectorEnv now"):

@@ -519,7 +519,6 @@ class TestGradient:
 
 class TestTransforms:
     # Raised by torch itself, the first time forward mode is used.
-    @pytest.mark.filterwarnings("ignore:`torch.jit.script` is deprecated:DeprecationWarning")
     @pytest.mark.parametrize("relaxation", ["gumbel_softmax", "implicit"])
     def test_forward_mode_agrees_with_differences(self, relaxation):
         parameters = random_parameters(3)

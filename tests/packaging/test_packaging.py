@@ -16,6 +16,7 @@ from pathlib import Path
 from zipfile import ZipFile
 
 import pytest
+import tiny
 import torch
 from packaging.requirements import Requirement
 
@@ -77,6 +78,19 @@ class TestImport:
             assert not hasattr(torchrl_safe, "no_such_block")
         """
         python(code, cwd=ROOT)
+
+    def test_training_names_its_extra(self):
+        code = """
+            import importlib.util
+            importlib.util.find_spec = lambda name: None
+            try:
+                import torchrl_safe.trainers.cli
+            except ModuleNotFoundError as error:
+                print(error)
+        """
+        said = python(code, cwd=ROOT)
+        assert said.startswith("training needs hydra and")
+        assert said.endswith("pip install 'torchrl-safe[train]'.")
 
     def test_what_is_missing_is_named_with_its_extra(self, tmp_path, monkeypatch):
         env = SafeRobotEnv("point", num_envs=1, num_threads=1)
@@ -186,32 +200,50 @@ class TestBuilt:
     def test_works_without_the_repository(self, built, tmp_path):
         """In an environment of its own, which borrows only the packages that it needs."""
         _, wheel = built
-        subprocess.run(
-            [sys.executable, "-m", "venv", "--without-pip", tmp_path / "venv"], check=True
-        )
+        environ = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"}
+        venv = tmp_path / "venv"
+        interpreter = venv / "bin" / "python"
+        pip = [sys.executable, "-m", "pip", "--python", interpreter]
+        for command in (
+            [sys.executable, "-m", "venv", "--without-pip", venv],
+            [*pip, "install", "-q", "--no-deps", "--no-index", wheel],
+        ):
+            subprocess.run(command, check=True, cwd=tmp_path, env=environ)
         scheme = sysconfig.get_preferred_scheme("prefix")
-        site = Path(sysconfig.get_path("purelib", scheme, {"base": str(tmp_path / "venv")}))
-        with ZipFile(wheel) as archive:
-            archive.extractall(site)  # as pip does with a wheel of Python alone
+        site = Path(sysconfig.get_path("purelib", scheme, {"base": str(venv)}))
         # A path in such a file is searched last, and its own .pth files, an editable install's
         # among them, are not read.
         (site / "borrowed.pth").write_text(sysconfig.get_path("purelib") + "\n")
-        environ = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"}
         code = """
             import torchrl_safe
             from torchrl.modules import MLP
             from torchrl_safe import *
-            from torchrl_safe.envs import ROBOTS, SafeRobotEnv, check_safe_env
+            from torchrl_safe.envs import ROBOTS, SafeRobotEnv
 
             for robot in ROBOTS:
                 env = SafeRobotEnv(robot, num_envs=2, num_threads=1)
-                actions = env.action_spec.shape[-1]
-                network = MLP(out_features=2 * (1 + 2 * actions), num_cells=[8])
+                network = MLP(out_features=2 * (1 + 2 * env.action_spec.shape[-1]), num_cells=[8])
                 policy = GMMTanhPolicy(network, env.action_spec, num_components=2)
-                check_safe_env(env)
                 assert env.rollout(5, policy)["next", "cost"].shape == (2, 5, 1)
             print(torchrl_safe.__file__)
         """
-        interpreter = tmp_path / "venv" / "bin" / "python"
-        file = python(code, interpreter, cwd=tmp_path, env=environ)
-        assert Path(file).is_relative_to(tmp_path / "venv")
+        assert Path(python(code, interpreter, cwd=tmp_path, env=environ)).is_relative_to(venv)
+
+        train = ["train", "safetac", "env=robot", "env.robot=point", "run_dir=run", *tiny.OVERRIDES]
+        for command in (
+            [*train, f"collector.total_frames={2 * tiny.FRAMES}"],
+            ["evaluate", "run", "--episodes", "2", "--no-film"],
+            ["play", "run", "--episodes", "2", "--steps", "10"],
+        ):
+            done = subprocess.run(
+                [venv / "bin" / "torchrl-safe", *command],
+                cwd=tmp_path,
+                env=environ,
+                capture_output=True,
+                text=True,
+            )
+            assert done.returncode == 0, done.stderr
+        for file in ("run/config.yaml", "run/results.json", "run/evaluation/results.json"):
+            assert (tmp_path / file).is_file()
+        (film,) = tmp_path.glob("*.mp4")
+        assert film.stat().st_size > 1000

@@ -77,7 +77,8 @@ def q_logarithm(log_prob: Tensor, entropic_index: float) -> Tensor:
     if order == 0.0:
         return log_prob
     exponent = order * log_prob
-    bounded = exponent.clamp(max=_MAX_EXPONENT)
+    # Not clamp, whose gradient at the bound itself depends on torch's version.
+    bounded = torch.where(exponent > _MAX_EXPONENT, _MAX_EXPONENT, exponent)
     excess = torch.relu(exponent - _MAX_EXPONENT)  # not from `bounded`: inf - inf
     return (torch.expm1(bounded) + math.exp(_MAX_EXPONENT) * excess) / order
 

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+from torchrl_safe._extras import need
+
+need("training", "train", "hydra", "imageio", "matplotlib", "pydantic", "tqdm")
+
 from torchrl_safe.trainers.methods import METHODS
 from torchrl_safe.trainers.offpolicy_trc import OffPolicyTRC
 from torchrl_safe.trainers.safetac import SafeTAC

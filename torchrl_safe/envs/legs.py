@@ -2,7 +2,7 @@
 
 One side of the body is described. The other side does what this one would do in a mirror, half a
 period later: a robot alike on both sides walks alike to both sides. The weights are made by
-``examples/doggo_controller.py``, which learns on the very input that is computed here.
+``benchmarks/doggo_controller.py``, which learns on the very input that is computed here.
 """
 
 from __future__ import annotations

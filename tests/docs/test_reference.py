@@ -12,6 +12,8 @@ import pytest
 
 import torchrl_safe
 
+pytest.importorskip("dm_control")  # its interface has entries, too
+
 REFERENCE = Path(__file__).parents[2] / "docs" / "reference"
 ENTRY = re.compile(r"^\.\. (?:auto\w+|py:\w+):: (torchrl_safe\S+)", re.MULTILINE)
 

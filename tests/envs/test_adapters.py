@@ -32,7 +32,6 @@ from torchrl_safe.envs import (
     check_safe_env,
     cost_from_info,
 )
-from torchrl_safe.envs.interfaces import suite
 
 POINT = "torchrl_safe/PointGoal-v0"
 
@@ -159,7 +158,7 @@ class TestCostFromInfo:
         env = cost_from_info(GymWrapper(Shows([])), {"cash": "cost"})
         assert "cash_cost" in env.full_reward_spec.keys()
 
-    def test_rejects(self):
+    def test_rejects(self, suite):
         with pytest.raises(TypeError, match="must be a GymWrapper or GymEnv, got DMControlWrapper"):
             cost_from_info(DMControlWrapper(suite.load()))
         with pytest.raises(TypeError, match="env must not have transforms yet"):
@@ -352,17 +351,17 @@ class TestCostToReward:
         infos = [plain.step(action)[4] for action in rollout["action"].numpy()]
         assert_costs(rollout, [info["cost"] for info in infos])
 
-    def test_dm_control(self):
+    def test_dm_control(self, suite):
         env = DMControlWrapper(suite.load("point", random=0, episode_length=9))
         env = TransformedEnv(env, CostToReward(violation_key=None))  # it has its own
         check_safe_env(env, time_limit=9)
 
-    def test_names(self):
+    def test_names(self, suite):
         env = DMControlWrapper(suite.load("point", random=0))
         env = TransformedEnv(env, CostToReward(violation_key=("flags", "unsafe")))
         check_safe_env(env, violation_key=("flags", "unsafe"))
 
-    def test_another_name_for_the_cost(self):
+    def test_another_name_for_the_cost(self, suite):
         env = DMControlWrapper(suite.load("point", random=0, episode_length=9))
         env = TransformedEnv(env, RenameTransform(["cost"], ["danger"]))
         env.append_transform(CostToReward(cost_key="danger", violation_key=None))
@@ -371,7 +370,7 @@ class TestCostToReward:
         with pytest.raises(Exception, match="cost"):  # the default looks for another
             check_safe_env(env, time_limit=9)
 
-    def test_violation(self):
+    def test_violation(self, suite):
         env = DMControlWrapper(suite.load("point", random=0))
         env = TransformedEnv(env, CostToReward(violation_key="above", violation_above=0.01))
         rollout = env.rollout(200, lambda td: td.set("action", torch.tensor([1.0, 0.3]).double()))
@@ -380,7 +379,7 @@ class TestCostToReward:
         assert 0 < rollout["next", "above"].sum() < 200
         assert not env.reset()["above"].any()
 
-    def test_skipped_frames(self):
+    def test_skipped_frames(self, suite):
         """Their costs would be lost in silence, while TorchRL adds up their rewards."""
         for skipping in (
             DMControlWrapper(suite.load("point", random=0), frame_skip=2),
@@ -400,7 +399,7 @@ class TestCostToReward:
         with pytest.raises(ValueError, match="violation_above must be a number, got nan"):
             CostToReward(violation_above=float("nan"))
 
-    def test_rejects(self):
+    def test_rejects(self, suite):
         env = DMControlWrapper(suite.load("point", random=0))
         with pytest.raises(ValueError, match="has an observation 'violation' of its own"):
             _ = TransformedEnv(env, CostToReward()).observation_spec

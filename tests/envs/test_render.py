@@ -24,7 +24,6 @@ from gymnasium.utils.passive_env_checker import env_render_passive_checker
 from torchrl_safe.envs import ROBOTS, GymRobotEnv, SafeRobotEnv, get_robot
 from torchrl_safe.envs._render import Scene, SceneRenderer
 from torchrl_safe.envs._robot import make_core
-from torchrl_safe.envs.interfaces import suite
 
 
 def seeded_core(robot):
@@ -179,7 +178,7 @@ class TestRobotsOfOnesOwn:
         np.testing.assert_allclose(objects(scene), objects(expected))
 
     @pytest.mark.parametrize("what", FILES)
-    def test_dm_control(self, what, tmp_path):
+    def test_dm_control(self, suite, what, tmp_path):
         env = suite.load(dressed_point(tmp_path, FILES[what]), random=0)
         env.reset()
         env.step(np.ones(2))
@@ -222,7 +221,7 @@ class TestTogether:
         assert all((picture != first).any() for picture in others)
         envs.close()
 
-    def test_renderers_do_not_disturb_each_other(self, opengl):
+    def test_renderers_do_not_disturb_each_other(self, suite, opengl):
         """Also dm_control's, which draws whether or not its context is the current one."""
         one, two = (SafeRobotEnv(num_envs=1, num_threads=1, seed=seed) for seed in (0, 1))
         other = suite.load("point", random=2)
@@ -265,6 +264,8 @@ class TestTogether:
             other.reset()
             other.physics.render(48, 64)
         """
+        if order != "alone":
+            pytest.importorskip("dm_control")
         parts = {
             "alone": picture,
             "before dm_control": picture + other,
@@ -328,6 +329,8 @@ class TestTogether:
     @pytest.mark.skipif(sys.platform != "linux", reason="elsewhere there always is a display")
     @pytest.mark.parametrize("interface", ["SafeRobotEnv", "dm_control"])
     def test_a_display_that_leads_nowhere(self, interface, opengl):
+        if interface == "dm_control":
+            pytest.importorskip("dm_control")
         code = {
             "SafeRobotEnv": """
                 from torchrl_safe.envs import SafeRobotEnv

@@ -10,13 +10,17 @@ import mujoco
 import numpy as np
 import pytest
 import torch
-from dm_control.rl import control
-from dm_env import StepType
 from tensordict import TensorDict
 from torchrl.envs import DMControlWrapper
 from torchrl.envs.utils import check_env_specs
 
 from torchrl_safe.envs import ROBOTS, GoalTask, NavigationTask, SafeRobotEnv
+
+pytest.importorskip("dm_control")
+
+from dm_control.rl import control
+from dm_env import StepType
+
 from torchrl_safe.envs.interfaces import suite
 
 

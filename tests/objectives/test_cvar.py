@@ -788,6 +788,21 @@ class TestWhatWasGiven:
             CVaRCostLoss(make_actor(), *heads, cost_limit=1.0, num_cost_nets=2)
 
 
+class TestInputs:
+    def test_an_input_of_the_critics_that_is_missing(self):
+        loss, data = make_loss(), make_data()
+        with pytest.raises(KeyError, match="'observation', an input of the critic, is not in"):
+            loss.cvar(data.exclude("observation"), data["action"])
+
+    @pytest.mark.parametrize(("estimator", "reads"), [("retrace", True), ("td0", False)])
+    def test_retrace_alone_reads_what_took_the_action(self, estimator, reads):
+        loss = make_loss()
+        loss.make_value_estimator(estimator, gamma=0.9)
+        assert ("action_log_prob" in loss.in_keys) is reads
+        data = make_data()
+        loss(data if reads else data.exclude("action_log_prob"))
+
+
 class TestLimits:
     """Both may be changed and loaded, and are checked whenever they are set."""
 

@@ -5,13 +5,14 @@ import numpy as np
 import pytest
 import torch
 
-from torchrl_safe.envs import SafeGoalEnv
+from torchrl_safe.envs import SafeRobotEnv, SafeVelocityEnv
+from torchrl_safe.envs.tasks import get_task
 from torchrl_safe.record import plot_trajectories, record_trajectories
 
 
 @pytest.fixture
 def env():
-    return SafeGoalEnv("point", num_envs=3, num_threads=1, episode_length=40)
+    return SafeRobotEnv("point", num_envs=3, num_threads=1, episode_length=40)
 
 
 def ahead(td):
@@ -87,9 +88,24 @@ def test_misuse(env, tmp_path):
 
 def test_boxes(tmp_path):
     """A Jackal's room has boxes in place of hazards."""
-    env = SafeGoalEnv("jackal", num_envs=1, num_threads=1, seed=0)
+    env = SafeRobotEnv("jackal", num_envs=1, num_threads=1, seed=0)
     (only,) = record_trajectories(env, env.rand_action, num_steps=3, num_episodes=1, seed=0)
     np.testing.assert_array_equal(only["boxes"], env.layout(0)["boxes"])
     assert only["boxes"].shape == (8, 2)
     assert only["hazards"].shape == (0, 2)
     assert plot_trajectories([only], tmp_path / "jackal.png").stat().st_size > 5_000
+
+
+def test_a_task_without_goals_or_hazards(tmp_path):
+    task = get_task("SafetyPointCircle0")[1]
+    env = SafeRobotEnv("point", task=task, num_envs=2, num_threads=1)
+    (only,) = record_trajectories(env, env.rand_action, num_steps=4, num_episodes=1)
+    assert only["path"].shape == (5, 2)
+    assert only["goals"].shape == (0, 2)
+    assert plot_trajectories([only], tmp_path / "map.png").exists()
+
+
+def test_an_environment_without_a_map():
+    env = SafeVelocityEnv("hopper", num_envs=2, num_threads=1)
+    with pytest.raises(TypeError, match=r"env must have layout\(index\), .* got SafeVelocityEnv"):
+        record_trajectories(env, env.rand_action, num_steps=2, num_episodes=1)

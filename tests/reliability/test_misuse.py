@@ -7,6 +7,7 @@ allowed. Whatever has a state is compared before and after, and so is the random
 from __future__ import annotations
 
 import copy
+import importlib.util
 import math
 from collections.abc import Callable
 from functools import cache, partial, reduce
@@ -44,7 +45,6 @@ from torchrl_safe import (
     envs,
     record,
 )
-from torchrl_safe.envs.interfaces import suite
 from torchrl_safe.modules import (
     DeterministicAction,
     GMMParamExtractor,
@@ -1304,40 +1304,43 @@ bad(
     "Tank",
     "oesn't exist",
 )
-control = cache(lambda: suite.load(random=0))
-control().reset()
-control_state = lambda: control().task._core.snapshot()  # noqa: E731
-each("suite.load", suite.load, "robot", ("unicycle",), ROBOT)
-each("suite.load", suite.load, "task", ("push",), "one of goal, navigation")
-each("suite.load", suite.load, "episode_length", (0,), "an integer >= 1")
-each("suite.load", suite.load, "random", (-1,), ">= 0")
-bad(
-    "suite.Physics.set_control: shape",
-    lambda: control().physics.set_control(np.zeros(3)),
-    ValueError,
-    "action",
-    "(3,)",
-    "(2,)",
-    state=control_state,
-)
-bad(
-    "suite.Physics.step: nstep",
-    lambda: control().physics.step(3),
-    ValueError,
-    "nstep",
-    "3",
-    "must be 10",
-    state=control_state,
-)
-bad(
-    "suite.SafeTask: NaN",
-    lambda: control().step(np.full(2, NAN)),
-    ValueError,
-    "action",
-    "[0]",
-    "must be finite",
-    state=control_state,
-)
+if importlib.util.find_spec("dm_control"):
+    from torchrl_safe.envs.interfaces import suite
+
+    control = cache(lambda: suite.load(random=0))
+    control().reset()
+    control_state = lambda: control().task._core.snapshot()  # noqa: E731
+    each("suite.load", suite.load, "robot", ("unicycle",), ROBOT)
+    each("suite.load", suite.load, "task", ("push",), "one of goal, navigation")
+    each("suite.load", suite.load, "episode_length", (0,), "an integer >= 1")
+    each("suite.load", suite.load, "random", (-1,), ">= 0")
+    bad(
+        "suite.Physics.set_control: shape",
+        lambda: control().physics.set_control(np.zeros(3)),
+        ValueError,
+        "action",
+        "(3,)",
+        "(2,)",
+        state=control_state,
+    )
+    bad(
+        "suite.Physics.step: nstep",
+        lambda: control().physics.step(3),
+        ValueError,
+        "nstep",
+        "3",
+        "must be 10",
+        state=control_state,
+    )
+    bad(
+        "suite.SafeTask: NaN",
+        lambda: control().step(np.full(2, NAN)),
+        ValueError,
+        "action",
+        "[0]",
+        "must be finite",
+        state=control_state,
+    )
 
 # Records.
 

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 from torchrl_safe._deprecation import moved
 from torchrl_safe.envs._moved import keep_old_paths
 from torchrl_safe.envs.adapters import CostToReward, cost_from_info
+from torchrl_safe.envs.bridge import SafetyGymnasiumBridge
 from torchrl_safe.envs.checks import check_safe_env
 from torchrl_safe.envs.interfaces.registration import register_envs
 from torchrl_safe.envs.randomization import (
@@ -57,6 +58,7 @@ __all__ = [
     "SafeGoalEnv",
     "SafeRobotEnv",
     "SafeVelocityEnv",
+    "SafetyGymnasiumBridge",
     "VelocityTask",
     "check_safe_env",
     "cost_from_info",

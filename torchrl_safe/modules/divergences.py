@@ -232,7 +232,7 @@ MATCHED_BOUND = Distance(_mixture, _mixture_kl)
 """Mixtures by every component and its weight; with one component the same as the moments."""
 
 CATEGORICAL = Distance(_logits, _logits_kl)
-"""Discrete policies by their probabilities: what has ``logits``, in one dimension of actions."""
+"""Discrete policies by their probabilities; any distribution that has ``logits`` of one action."""
 
 DISTANCES = {
     "moment_matched": MOMENT_MATCHED,

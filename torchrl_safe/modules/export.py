@@ -11,6 +11,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 from torchrl.modules import ProbabilisticActor
 
+from torchrl_safe._extras import need
 from torchrl_safe._files import expand, replacing
 
 __all__ = ["DeterministicAction", "export_policy"]
@@ -97,7 +98,7 @@ def export_policy(
     if missing:
         raise KeyError(f"example must have the policy's in_keys; {missing} are missing.")
     if path.suffix == ".onnx":
-        _need("onnx", "onnxscript")
+        need("writing .onnx (.pt2 needs torch alone)", "export", "onnx", "onnxscript")
     # A batch of one would be taken for a constant.
     inputs = tuple(
         example.get(key)[:1].expand(2, *example.get(key).shape[1:]).clone()
@@ -129,14 +130,3 @@ def export_policy(
 
 def _flat(key: str | tuple[str, ...]) -> str:
     return key if isinstance(key, str) else ".".join(key)
-
-
-def _need(*packages: str) -> None:
-    from importlib.util import find_spec
-
-    missing = [package for package in packages if find_spec(package) is None]
-    if missing:
-        raise ModuleNotFoundError(
-            f"writing .onnx needs {' and '.join(missing)}: pip install 'torchrl-safe[export]', or "
-            "write .pt2, which needs torch alone."
-        )

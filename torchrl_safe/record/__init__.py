@@ -1,7 +1,8 @@
 """Metrics of safe agents, learning curves, tables and videos.
 
-They work on any TorchRL environment that writes ``reward``, ``cost``, ``violation`` and
-``goal_met`` under ``"next"``.
+They work on any TorchRL environment that writes ``reward``, ``cost`` and ``violation`` under
+``"next"``, or ``<name>_cost`` and ``<name>_violation`` for each of several costs. Goals are counted
+where ``goal_met`` is written, and paths drawn where an environment has a ``layout``.
 """
 
 from torchrl_safe.record.calibration import calibrate, discounted_sums, plot_calibration

@@ -14,6 +14,7 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
+from torchrl_safe._extras import need
 from torchrl_safe._files import expand, replacing
 
 __all__ = ["calibrate", "discounted_sums", "plot_calibration"]
@@ -159,6 +160,7 @@ def plot_calibration(bins: TensorDict, path: str | os.PathLike[str]) -> Path:
         ...     plot_calibration(bins, f"{folder}/calibration.png").name
         'calibration.png'
     """
+    need("a plot", "train", "matplotlib")
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(9, 4.4), layout="constrained")

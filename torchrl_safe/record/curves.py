@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from torchrl_safe._extras import need
 from torchrl_safe._files import expand, printable, read_bytes, regular_files, replacing
 
 if TYPE_CHECKING:
@@ -103,6 +104,7 @@ def plot_learning_curves(run_dir: str | os.PathLike[str], path: str | os.PathLik
         ...     plot_learning_curves(folder, f"{folder}/curves.png").name
         'curves.png'
     """
+    need("a plot", "train", "matplotlib")
     from matplotlib.figure import Figure
     from matplotlib.layout_engine import ConstrainedLayoutEngine
     from matplotlib.ticker import EngFormatter

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import contextlib
 import math
+from collections import defaultdict
 from collections.abc import Callable, Iterator
 
 import torch
@@ -23,7 +24,7 @@ from torch import Tensor
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from torchrl_safe._costs import costs_among, violation_key
+from torchrl_safe._costs import costs_among, prefix_of, violation_key
 
 __all__ = [
     "batch_metrics",
@@ -37,7 +38,6 @@ __all__ = [
 ]
 
 _NUM_RESAMPLES = 2_000
-_OPTIONAL = {("next", "goal_met")}  # not every environment has goals
 
 
 def score(episode_return: Tensor, violations: Tensor) -> Tensor:
@@ -160,8 +160,8 @@ def evaluate(
     Args:
         env (EnvBase): batch size [\*N], with leaves of shape [\*N, 1] ``("next", "reward")``,
             ``("next", "cost")``, ``("next", "violation")`` or ``("next", "violations")``, and
-            ``("next", "goal_met")`` if there are goals. Of several costs, each has a leaf
-            ``("next", "<name>_cost")``.
+            ``("next", "goal_met")`` if there are goals. Of several costs, ``"<name>_cost"`` and
+            ``"<name>_violation"`` each.
         policy (callable): from tensordict to tensordict with the action. Put a policy with
             dropout or the like in ``eval()`` mode first.
 
@@ -176,10 +176,12 @@ def evaluate(
     Returns:
         TensorDict: batch size [\*N], per episode. In float64: ``episode_return``, ``violations``
         (steps), ``entries`` (violating steps after one that was none, or at the start), ``cv_rate``
-        and ``cost_rate`` (per step), ``cost`` and ``discounted_cost`` (sums; of several costs
-        ``speed_cost``, ``discounted_speed_cost``, ``speed_cost_rate`` and so on), ``score``,
-        ``goals`` (steps that met one), ``length`` (steps taken). In bool, how it ended:
-        ``terminated``, ``truncated``, or neither if ``num_steps`` were over first.
+        and ``cost_rate`` (per step), ``cost`` and ``discounted_cost`` (sums), ``score``,
+        ``length`` (steps taken); where there are goals, ``goals`` (steps that met one). Of several
+        costs, ``<name>_cost``, ``<name>_discounted_cost``, ``<name>_cost_rate``,
+        ``<name>_violations`` and ``<name>_cv_rate`` each, and ``violations`` counts steps that
+        violate any. In bool, how it ended: ``terminated``, ``truncated``, or neither if
+        ``num_steps`` were over first.
 
     Raises:
         ValueError: if ``num_steps`` is not positive, ``cost_gamma`` is not in [0, 1], or a leaf has
@@ -188,8 +190,8 @@ def evaluate(
 
     Examples:
         >>> from torchrl.envs.utils import ExplorationType
-        >>> from torchrl_safe.envs import SafeGoalEnv
-        >>> env = SafeGoalEnv("point", num_envs=2, num_threads=1)
+        >>> from torchrl_safe.envs import SafeRobotEnv
+        >>> env = SafeRobotEnv("point", num_envs=2, num_threads=1)
         >>> episodes = evaluate(
         ...     env, env.rand_action, num_steps=5, exploration_type=ExplorationType.RANDOM, seed=0
         ... )
@@ -202,14 +204,9 @@ def evaluate(
         raise ValueError(f"num_steps must be at least 1, got {num_steps}.")
     if not 0.0 <= cost_gamma <= 1.0:
         raise ValueError(f"cost_gamma must be in [0, 1], got {cost_gamma}.")
-    costs = costs_among(env.full_reward_spec.keys()) or ("cost",)
-    names = (
-        *("reward", "violations", "entries", "goal_met", "length", "duration"),
-        *costs,
-        *(f"discounted_{cost}" for cost in costs),
-    )
+    costs = costs_among(env.full_reward_spec.keys(True, True))
     zero = torch.zeros(env.batch_size, dtype=torch.float64, device=env.device)
-    total = {name: zero.clone() for name in names}
+    total: dict[str, Tensor] = defaultdict(zero.clone)
     running = torch.ones(env.batch_size, dtype=torch.bool, device=env.device)
     violated = torch.zeros_like(running)
     ends = {name: torch.zeros_like(running) for name in ("terminated", "truncated")}
@@ -222,11 +219,17 @@ def evaluate(
         for step in range(num_steps):
             stepped, td = env.step_and_maybe_reset(policy(td))
             violations = _violations(stepped)
-            for name in ("reward", "goal_met", *costs):
-                total[name] += _signal(stepped, ("next", name)).double().where(running, 0.0)
-            for name in costs:
-                cost = cost_gamma**step * _signal(stepped, ("next", name)).double()
-                total[f"discounted_{name}"] += cost.where(running, 0.0)
+            total["reward"] += _signal(stepped, ("next", "reward")).double().where(running, 0.0)
+            if "goal_met" in stepped["next"].keys():
+                total["goals"] += _signal(stepped, ("next", "goal_met")) & running
+            for key in costs or ("cost",):
+                prefix = prefix_of(key)
+                cost = _signal(stepped, ("next", key)).double().where(running, 0.0)
+                total[key] += cost
+                total[f"{prefix}discounted_cost"] += cost_gamma**step * cost
+                if prefix:
+                    own = _violations(stepped, prefix)
+                    total[f"{prefix}violations"] += own.where(running, 0.0)
             total["violations"] += violations.where(running, 0.0)
             total["entries"] += running & (violations > 0) & ~violated
             violated = violations > 0
@@ -237,17 +240,19 @@ def evaluate(
             running = running & ~_signal(stepped, ("next", "done"))
             if not running.any():
                 break
+    duration, episode_return = total.pop("duration"), total.pop("reward")
+    rates = {f"{key}_rate": total[key] / duration for key in costs}
+    rates |= {
+        f"{name.removesuffix('violations')}cv_rate": total[name] / duration
+        for name in total
+        if name.endswith("violations")
+    }
     return TensorDict(
         {
-            "episode_return": total["reward"],
-            "violations": total["violations"],
-            "entries": total["entries"],
-            "cv_rate": total["violations"] / total["duration"],
-            "score": score(total["reward"], total["violations"]),
-            **{name: total[name] for cost in costs for name in (cost, f"discounted_{cost}")},
-            **{f"{cost}_rate": total[cost] / total["duration"] for cost in costs},
-            "goals": total["goal_met"],
-            "length": total["length"],
+            "episode_return": episode_return,
+            "score": score(episode_return, total["violations"]),
+            **total,
+            **rates,
             **ends,
         },
         batch_size=env.batch_size,
@@ -262,9 +267,9 @@ def summarize(episodes: TensorDictBase, prefix: str = "eval/") -> dict[str, floa
         prefix (str): put before every name. Defaults to ``"eval/"``.
 
     Returns:
-        dict of float: ``return``, ``violations``, ``entries``, ``cv_rate``, ``score``, ``cost``,
-        ``discounted_cost``, ``cost_rate``, ``goals``, ``length``, the shares ``terminated`` and
-        ``truncated``, and the 95 % interval ``score_low``, ``score_high`` of the score.
+        dict of float: ``return``, the means of all other entries (of ``terminated`` and
+        ``truncated``, the shares), and the 95 % interval ``score_low``, ``score_high`` of the
+        score.
 
     Raises:
         ValueError: if there is no episode.
@@ -293,14 +298,15 @@ def describe(episodes: TensorDictBase) -> list[dict[str, float | int | str]]:
         episodes (TensorDictBase): what :func:`evaluate` returned, any batch size.
 
     Returns:
-        list of dict, one per episode: ``return``, ``score``, ``cost``, ``discounted_cost``; the
-        counts ``violations``, ``entries``, ``goals`` and ``length``; and ``end``, which is
-        ``"terminated"``, ``"truncated"`` or, where steps were over first, ``"running"``.
+        list of dict, one per episode: ``return``, ``score``, ``cost``, ``discounted_cost`` (of
+        several costs, each); the counts ``violations`` (of each, too), ``entries``, ``length`` and,
+        where there are any, ``goals``; and ``end``, which is ``"terminated"``, ``"truncated"`` or,
+        where steps were over first, ``"running"``.
 
     Examples:
         >>> from torchrl.envs.utils import ExplorationType
-        >>> from torchrl_safe.envs import SafeGoalEnv
-        >>> env = SafeGoalEnv("point", num_envs=2, num_threads=1)
+        >>> from torchrl_safe.envs import SafeRobotEnv
+        >>> env = SafeRobotEnv("point", num_envs=2, num_threads=1)
         >>> episodes = evaluate(
         ...     env, env.rand_action, num_steps=5, exploration_type=ExplorationType.RANDOM, seed=0
         ... )
@@ -308,14 +314,14 @@ def describe(episodes: TensorDictBase) -> list[dict[str, float | int | str]]:
         [(5, 'running'), (5, 'running')]
     """
     episodes = episodes.flatten()
-    costs = costs_among(name for name in episodes.keys() if not name.startswith("discounted_"))
-    sums = [name for cost in costs for name in (cost, f"discounted_{cost}")]
     columns = {
         "return": episodes["episode_return"].tolist(),
-        **{name: episodes[name].tolist() for name in ("score", *sums)},
+        "score": episodes["score"].tolist(),
+        **{name: episodes[name].tolist() for name in costs_among(episodes.keys())},
         **{
             name: episodes[name].long().tolist()
-            for name in ("violations", "entries", "goals", "length")
+            for name in episodes.keys()
+            if name.endswith("violations") or name in ("entries", "goals", "length")
         },
         "end": [
             "terminated" if terminated else "truncated" if truncated else "running"
@@ -366,7 +372,8 @@ def batch_metrics(td: TensorDictBase, prefix: str = "train/") -> dict[str, float
 
     Returns:
         dict of float: ``reward_per_1000`` (reward per 1,000 steps, comparable with an episode's
-        return), ``cost_rate`` and ``cv_rate`` (per step).
+        return), ``cost_rate`` and ``cv_rate`` (per step); of several costs, ``<name>_cost_rate``
+        and ``<name>_cv_rate`` each, and ``cv_rate`` of steps that violate any.
 
     Raises:
         KeyError: if a leaf is missing.
@@ -382,16 +389,15 @@ def batch_metrics(td: TensorDictBase, prefix: str = "train/") -> dict[str, float
     """
     if not td.batch_size.numel():
         raise ValueError(f"td must hold at least one step, got batch size {tuple(td.batch_size)}.")
-    costs = costs_among(td["next"].keys()) or ("cost",)
-    signals = [_signal(td, ("next", name)).double() for name in ("reward", *costs)]
-    violations = _violations(td)
-    sums = torch.stack([signal.sum() for signal in (*signals, violations)])
-    reward, *rates, violation = (sums / violations.clamp(min=1.0).sum()).tolist()
-    return {
-        f"{prefix}reward_per_1000": 1_000 * reward,
-        **{f"{prefix}{cost}_rate": rate for cost, rate in zip(costs, rates, strict=True)},
-        f"{prefix}cv_rate": violation,
-    }
+    signals = {"reward_per_1000": 1_000 * _signal(td, ("next", "reward")).double()}
+    for key in _costs_of(td) or ("cost",):
+        signals[f"{key}_rate"] = _signal(td, ("next", key)).double()
+        if own := prefix_of(key):
+            signals[f"{own}cv_rate"] = _violations(td, own)
+    violations = signals["cv_rate"] = _violations(td)
+    sums = torch.stack([signal.sum() for signal in signals.values()])
+    rates = (sums / violations.clamp(min=1.0).sum()).tolist()
+    return {prefix + name: rate for name, rate in zip(signals, rates, strict=True)}
 
 
 @contextlib.contextmanager
@@ -419,26 +425,27 @@ def acting(exploration_type: ExplorationType) -> Iterator[None]:
         yield
 
 
-def _violations(td: TensorDictBase) -> Tensor:
-    """How many violating steps each step counts for, [*B], float64.
+def _costs_of(td: TensorDictBase) -> tuple[str, ...]:
+    """The costs of steps: what else is called so has no violation."""
+    keys = td["next"].keys()
+    return tuple(key for key in costs_among(keys) if key == "cost" or violation_key(key) in keys)
 
-    Of several costs without a flag for all of them, a step violates if one of their own is set.
-    """
-    names = set(td["next"].keys()) if "next" in td.keys() else set()
-    flags = [violation_key(cost) for cost in costs_among(names)]
-    if "violations" in names:
-        flags = ["violations"]
-    elif "violation" in names or not flags:
-        flags = ["violation"]
-    signals = [_signal(td, ("next", flag)).double() for flag in flags]
-    return signals[0] if len(signals) == 1 else torch.stack(signals).amax(0)
+
+def _violations(td: TensorDictBase, prefix: str = "") -> Tensor:
+    """How many violating steps each step counts for, of one cost or of any, [*B], float64."""
+    keys = td["next"].keys()
+    for name in (f"{prefix}violations", f"{prefix}violation"):
+        if name in keys:
+            return _signal(td, ("next", name)).double()
+    several = [prefix_of(key) for key in _costs_of(td) if key != "cost"]
+    if prefix or not several:
+        return _signal(td, ("next", f"{prefix}violation")).double()  # which says what is missing
+    return torch.stack([_violations(td, own) for own in several]).amax(0)
 
 
 def _signal(td: TensorDictBase, key: NestedKey) -> Tensor:
     """The leaf ``key`` of shape [*B, 1] as [*B]."""
     value = td.get(key, None)
-    if value is None and key in _OPTIONAL:
-        return torch.zeros(td.batch_size, dtype=torch.bool, device=td.device)
     if value is None:
         raise KeyError(f"{key} is missing; the tensordict has {sorted(map(str, td.keys(True)))}.")
     if value.shape != (*td.batch_size, 1):

@@ -14,6 +14,7 @@ from tensordict import TensorDictBase
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType
 
+from torchrl_safe._extras import need
 from torchrl_safe._files import expand, replacing
 from torchrl_safe.record.metrics import acting
 
@@ -25,7 +26,7 @@ class Trajectory(TypedDict):
 
     Attributes:
         path: positions of the robot, ``[T + 1, 2]``.
-        goals: the goals it was sent to, in order, ``[G, 2]``.
+        goals: the goals it was sent to, in order, ``[G, 2]``; none in a task without.
         hazards: centres of the hazards, ``[H, 2]``; none in a task without.
         boxes: centres of the boxes, ``[B, 2]``; none in a task without.
         violation: for each position, whether it violates there, ``[T + 1]``.
@@ -51,8 +52,8 @@ def record_trajectories(
 
     Args:
         env (EnvBase): batch size [N], writes ``violation``, and has ``layout(index)`` that returns
-            ``robot`` [2], ``goal`` [2] and, where there are any, ``hazards`` [H, 2] and ``boxes``
-            [B, 2], as :class:`~torchrl_safe.envs.SafeGoalEnv` does. Not the collector's, see
+            ``robot`` [2] and, where there are any, ``goal`` [2], ``hazards`` [H, 2] and ``boxes``
+            [B, 2], as :class:`~torchrl_safe.envs.SafeRobotEnv` does. Not the collector's, see
             :func:`~torchrl_safe.record.evaluate`.
         policy (callable): from tensordict to tensordict with the action.
 
@@ -68,15 +69,21 @@ def record_trajectories(
         list of Trajectory: one per episode, up to its end.
 
     Raises:
+        TypeError: if the environment has no ``layout``: there is no map to draw then.
         ValueError: if a number is out of range.
 
     Examples:
-        >>> from torchrl_safe.envs import SafeGoalEnv
-        >>> env = SafeGoalEnv("point", num_envs=2, num_threads=1)
+        >>> from torchrl_safe.envs import SafeRobotEnv
+        >>> env = SafeRobotEnv("point", num_envs=2, num_threads=1)
         >>> (first,) = record_trajectories(env, env.rand_action, num_steps=5, num_episodes=1)
         >>> first["path"].shape, first["hazards"].shape
         ((6, 2), (8, 2))
     """
+    if not callable(getattr(env, "layout", None)):
+        raise TypeError(
+            "env must have layout(index), which says where things are, as SafeRobotEnv does, got "
+            f"{type(env).__name__}."
+        )
     if num_steps < 1:
         raise ValueError(f"num_steps must be at least 1, got {num_steps}.")
     if not 1 <= num_episodes <= env.batch_size.numel():
@@ -110,7 +117,7 @@ def record_trajectories(
     return [
         Trajectory(
             path=np.stack([layout["robot"] for layout in layouts]),
-            goals=_changes(np.stack([layout["goal"] for layout in layouts])),
+            goals=_changes([layout["goal"] for layout in layouts if "goal" in layout]),
             hazards=layouts[0].get("hazards", np.empty((0, 2))),
             boxes=layouts[0].get("boxes", np.empty((0, 2))),
             violation=np.array(flags),
@@ -146,8 +153,8 @@ def plot_trajectories(
 
     Examples:
         >>> import tempfile
-        >>> from torchrl_safe.envs import SafeGoalEnv
-        >>> env = SafeGoalEnv("point", num_envs=2, num_threads=1)
+        >>> from torchrl_safe.envs import SafeRobotEnv
+        >>> env = SafeRobotEnv("point", num_envs=2, num_threads=1)
         >>> trajectories = record_trajectories(env, env.rand_action, num_steps=5, num_episodes=2)
         >>> with tempfile.TemporaryDirectory() as folder:
         ...     plot_trajectories(trajectories, f"{folder}/trajectories.png").name
@@ -155,6 +162,7 @@ def plot_trajectories(
     """
     if not trajectories:
         raise ValueError("trajectories must hold at least one, got none.")
+    need("a plot", "train", "matplotlib")
     from matplotlib.figure import Figure
     from matplotlib.patches import Circle, Rectangle
 
@@ -180,8 +188,10 @@ def plot_trajectories(
         axes.plot(x[0], y[0], marker="s", color="#333333", ms=5)
         inside = trajectory["violation"]
         axes.plot(x[inside], y[inside], ".", color="#D55E00", ms=4)
-        reached = len(trajectory["goals"]) - 1
-        axes.set_title(f"goals {reached}, violations {inside.sum()}", fontsize=9)
+        title = f"violations {inside.sum()}"
+        if len(trajectory["goals"]):
+            title = f"goals {len(trajectory['goals']) - 1}, {title}"
+        axes.set_title(title, fontsize=9)
         axes.set_aspect("equal")
         axes.tick_params(labelsize=7)
     path = expand(path)
@@ -191,8 +201,9 @@ def plot_trajectories(
     return path
 
 
-def _changes(points: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The rows of [T, 2] that differ from the row before, and the first."""
+def _changes(places: list[NDArray[np.float64]]) -> NDArray[np.float64]:
+    """Those of T places [2] that differ from the one before, and the first, [G, 2]."""
+    points = np.array(places).reshape(-1, 2)
     new = np.ones(len(points), bool)
     new[1:] = (points[1:] != points[:-1]).any(-1)
     return points[new]

@@ -8,13 +8,13 @@ from collections.abc import Callable, Sequence
 from contextlib import closing
 from pathlib import Path
 
-import imageio.v2 as imageio
 import numpy as np
 import torch
 from tensordict import TensorDictBase
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType
 
+from torchrl_safe._extras import need
 from torchrl_safe._files import expand, replacing
 from torchrl_safe.record.metrics import acting
 
@@ -68,8 +68,8 @@ def record_video(
         RuntimeError: if the environment cannot render here, for example without OpenGL.
 
     Examples:
-        >>> from torchrl_safe.envs import SafeGoalEnv
-        >>> env = SafeGoalEnv("point", num_envs=1, num_threads=1)
+        >>> from torchrl_safe.envs import SafeRobotEnv
+        >>> env = SafeRobotEnv("point", num_envs=1, num_threads=1)
         >>> # Needs OpenGL, so it is not run as a test.
         >>> record_video(env, env.rand_action, "point.mp4")  # doctest: +SKIP
         PosixPath('point.mp4')
@@ -101,6 +101,9 @@ def record_video(
                 f"the environment could not render ({type(error).__name__}: {error}); without a "
                 "display, MUJOCO_GL=egl or MUJOCO_GL=osmesa renders off screen where installed."
             ) from error
+
+    need("a video", "train", "imageio", "imageio_ffmpeg")
+    import imageio.v2 as imageio
 
     path.parent.mkdir(parents=True, exist_ok=True)
     with replacing(path) as draft:

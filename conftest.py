@@ -1,26 +1,41 @@
-"""What holds for every test: one thread of torch, and a checkout that is left as it was."""
+"""For every test: one thread, a checkout left as it was, dm-control where it can be installed."""
 
 from __future__ import annotations
 
+import importlib.util
 import os
+import shutil
 import subprocess
 from pathlib import Path
+from types import ModuleType
 
 import pytest
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parent
 LEFT_BEHIND = pytest.StashKey[set[str]]()
 
 # Workers share the cores, and sums have the same last bits on every machine. Read when torch loads.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
+if importlib.util.find_spec("dm_control") is None:
+    collect_ignore = ["torchrl_safe/envs/interfaces/suite.py"]  # its examples
+
+
+@pytest.fixture
+def suite() -> ModuleType:
+    """The dm_control interface, from Python 3.13 on a reason to skip."""
+    pytest.importorskip("dm_control")
+    return importlib.import_module("torchrl_safe.envs.interfaces.suite")
+
 
 def untracked() -> set[str]:
     """What git neither tracks nor ignores in the checkout, empty folders included."""
+    if shutil.which("git") is None:
+        return set()
     listing = subprocess.run(
         ["git", "clean", "--dry-run", "-d"], cwd=ROOT, capture_output=True, text=True, check=False
     )
-    return set(listing.stdout.splitlines())  # none without git, as in a source distribution
+    return set(listing.stdout.splitlines())  # none in a source distribution
 
 
 def is_worker(config: pytest.Config) -> bool:

@@ -3,7 +3,7 @@
     python benchmarks/keep_policy.py runs/safetac_point/seed_0 safetac-point
 
 Writes ``torchrl_safe/policies/<name>.safetensors``: weights, the run's options, the command and
-commit, and the mean and 95 % interval of the return, the cost and the score of 100 episodes with
+commit, and the mean and 95 % interval of return, costs, violations and score of 100 episodes with
 deterministic actions on layouts that neither training nor its evaluations saw.
 """
 
@@ -19,7 +19,7 @@ from torchrl.envs.utils import ExplorationType
 
 from torchrl_safe import policies
 from torchrl_safe.record import bootstrap_interval, evaluate
-from torchrl_safe.trainers.environments import make_env
+from torchrl_safe.trainers.environments import cost_names, make_env
 from torchrl_safe.trainers.options import MethodOptions, flat
 from torchrl_safe.trainers.run import cost_gamma
 from torchrl_safe.trainers.saved import from_newest
@@ -28,7 +28,6 @@ from torchrl_safe.trainers.streams import stream_seed
 
 LARGEST = 100_000  # bytes
 NUM_EPISODES = 100
-FIGURES = ("episode_return", "cost", "violations", "score")
 OF_THE_MACHINE = ("run_dir", "resume", "num_threads", "device")
 
 
@@ -58,9 +57,8 @@ def figures(saved: SavedPolicy, num_episodes: int, seed: int) -> dict[str, list[
         cost_gamma=cost_gamma(options),
     )
     env.close()
-    return {
-        name: [played[name].mean().item(), *bootstrap_interval(played[name])] for name in FIGURES
-    }
+    names = ("episode_return", *cost_names(options), "violations", "score")
+    return {name: [played[name].mean().item(), *bootstrap_interval(played[name])] for name in names}
 
 
 def keep_policy(run_dir: Path, path: Path, num_episodes: int = NUM_EPISODES) -> SavedPolicy:

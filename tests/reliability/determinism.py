@@ -27,8 +27,8 @@ import compose_trpo  # noqa: E402
 import compose_tsallis  # noqa: E402
 import numpy as np  # noqa: E402
 import retrace_sac  # noqa: E402
-import test_baselines as baselines  # noqa: E402
 import test_doggo_controller as doggo  # noqa: E402
+import test_methods as methods  # noqa: E402
 import tiny  # noqa: E402
 import torch  # noqa: E402
 from safetensors.numpy import load_file  # noqa: E402
@@ -47,8 +47,8 @@ SHORT = ["collector.total_frames=800", "eval.interval=10000", "checkpoint.interv
 
 
 def baseline(name: str, folder: Path) -> None:
-    script, overrides, _ = baselines.METHODS[name]
-    baselines.launch(script, folder, *overrides, *SHORT)
+    method, overrides, _ = methods.CASES[name]
+    methods.launch(method, folder, *overrides, *SHORT)
 
 
 def run_retrace_sac(folder: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import json
 import subprocess
 import sys
@@ -325,3 +326,10 @@ def test_resumed(trained, monkeypatch, capsys):
     with pytest.raises(ValueError, match=r"env.robot was .point. and is .car."):
         tiny.launch(trained, "resume=true", "collector.total_frames=300", "env.robot=car")
     assert (trained / "config.yaml").read_bytes() == before
+
+
+def test_page_of_configurations_is_the_declared_one(monkeypatch):
+    root = Path(options.__file__).parents[2]
+    monkeypatch.syspath_prepend(root / "docs")
+    write_options = importlib.import_module("write_options")
+    assert write_options.PAGE.read_text() == write_options.text(), "run docs/write_options.py"

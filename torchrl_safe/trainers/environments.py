@@ -69,6 +69,25 @@ def make_env(
         UntrustedError: if ``trust`` is false and the options name code.
         ValueError: if there is no such environment, or it has no cost.
     """
+    env = _make_env(options, num_envs, seed, training, source, trust, of_robots)
+    rewards = list(env.full_reward_spec.keys(True, True))
+    if missing := [name for name in cost_names(options) if name not in rewards]:
+        raise ValueError(
+            f"the environment must have a cost {missing[0]!r} beside the reward in its reward "
+            f"spec, which has {rewards}. loss.cost_limit names others: {{name: limit}}."
+        )
+    return env
+
+
+def _make_env(
+    options: MethodOptions,
+    num_envs: int,
+    seed: int,
+    training: bool,
+    source: MakeEnv | None,
+    trust: bool,
+    of_robots: dict[str, Any],
+) -> EnvBase:
     name, device = options.env.name, options.device
     if source is None and not trust and (code := names_code(options)) is not None:
         raise UntrustedError(
@@ -159,7 +178,9 @@ def imported(option: str, name: str) -> Callable[..., Any]:
 
 def has_state(env: EnvBase) -> bool:
     """Whether an environment's ``state_dict`` is all that its future depends on: of ours it is."""
-    return hasattr(env, "_core")
+    from torchrl_safe.envs._batched import BatchedEnv
+
+    return isinstance(env, BatchedEnv)
 
 
 def source_of(env: EnvBase | MakeEnv) -> tuple[MakeEnv, int | None]:
@@ -228,11 +249,6 @@ def _completed(env: EnvBase, options: MethodOptions) -> EnvBase:
     """With all entries that training, evaluation and plots read."""
     costs = cost_names(options)
     rewards = list(env.full_reward_spec.keys(True, True))
-    if missing := [name for name in costs if name not in rewards]:
-        raise ValueError(
-            f"the environment must have a cost {missing[0]!r} beside the reward in its reward "
-            f"spec, which has {rewards}. loss.cost_limit names others: {{name: limit}}."
-        )
     observations = env.full_observation_spec
     doubles = [key for key, spec in _leaves(observations) if spec.dtype == torch.float64]
     doubles += [key for key in rewards if env.full_reward_spec[key].dtype == torch.float64]

@@ -45,23 +45,24 @@ def make_policy(
         network (callable, optional): makes the network; by default it is an MLP of one vector.
     """
     inputs = [env.observation_spec[key] for key in in_keys]
+    spec = env.action_spec_unbatched  # the policy acts in one environment as well
     if is_discrete(env):
-        num_actions = env.action_spec.space.n
+        num_actions = spec.space.n
         module = _make(inputs, num_actions, options.policy.num_cells, options.device, network)
         return ProbabilisticActor(
             TensorDictModule(module, in_keys=list(in_keys), out_keys=["logits"]),
-            spec=env.action_spec,
+            spec=spec,
             in_keys=["logits"],
             distribution_class=OneHotCategorical,
             return_log_prob=True,
             log_prob_key="action_log_prob",
         )
-    num_outputs = options.policy.num_components * (1 + 2 * env.action_spec.shape[-1])
+    num_outputs = options.policy.num_components * (1 + 2 * spec.shape[-1])
     module = _make(inputs, num_outputs, options.policy.num_cells, options.device, network)
     low, high = options.policy.log_std_bounds
     return GMMTanhPolicy(
         module,
-        env.action_spec,
+        spec,
         num_components=options.policy.num_components,
         in_keys=list(in_keys),
         relaxation=options.policy.relaxation,

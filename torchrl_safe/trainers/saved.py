@@ -115,7 +115,7 @@ def load_run(run_dir: str | os.PathLike[str]) -> tuple[Options, Path]:
     return options_to_look(checkpoint, config.saved), checkpoint
 
 
-def from_newest(run_dir: str | os.PathLike[str], read: Callable[[Options, Path], T]) -> T:
+def from_newest(run_dir: str | os.PathLike[str], read: Callable[[Any, Path], T]) -> T:
     """What ``read`` makes of a run's options and newest checkpoint.
 
     A run that trains deletes a checkpoint when it has written the next; then the next is read. All

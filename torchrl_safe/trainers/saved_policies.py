@@ -15,7 +15,7 @@ import os
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 from safetensors import SafetensorError
 from safetensors.torch import load as load_tensors
@@ -33,7 +33,7 @@ from torchrl_safe.trainers.options import MethodOptions
 from torchrl_safe.trainers.saved import from_newest, options_to_look
 
 LIMIT = 2**24  # bytes of a policy's file
-Policy = GMMTanhPolicy | ProbabilisticActor
+Policy: TypeAlias = "GMMTanhPolicy | ProbabilisticActor"
 
 
 def load_policy(

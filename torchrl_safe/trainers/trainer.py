@@ -172,7 +172,7 @@ class Trainer(ABC):
             eval_env = self.make_env(self.options.eval.num_episodes, stream_seed("evaluation"))
             run.register(**self.build(eval_env))
             self._train(run, eval_env)
-            eval_env.close()
+            eval_env.close(raise_if_closed=False)  # one that nobody stepped is not open
         return self.policy
 
     def _train(self, run: Run, eval_env: EnvBase) -> None:

@@ -93,17 +93,18 @@ def main(
     # Before the episodes: a run that still trains replaces its checkpoint meanwhile.
     make = env_maker(env, trust)
     options, policy, cost_losses = from_newest(run_dir, partial(load, make=make))
+    if randomization and (env or options.env.name != "robot"):
+        raise ValueError(f"randomization={randomization} is of a robot, and this run has none.")
     num_steps = options.eval.num_steps
     seed = stream_seed("evaluate.py", seed)
     out = run_dir / (f"evaluation_{randomization}" if randomization else "evaluation")
     make_folder(out)
-    if randomization and (env or options.env.name != "robot"):
-        raise ValueError(f"randomization={randomization} is of a robot, and this run has none.")
     of_robots = {
         "episode_length": num_steps,
         "randomization": RANDOMIZATIONS.get(randomization or ""),
     }
     envs = make(options, episodes, seed, **of_robots)
+    goals = "goal_met" in envs.full_observation_spec.keys()
     metrics: dict[str, float] = {}
     episodes_played = {}
     for prefix, kind in (("det/", "DETERMINISTIC"), ("sampled/", "RANDOM")):
@@ -116,7 +117,7 @@ def main(
             cost_gamma=cost_gamma(options),
         )
         episodes_played[prefix] = describe(played)
-        metrics |= summarize(played, prefix) | shares(played, prefix)
+        metrics |= summarize(played, prefix) | shares(played, prefix, goals)
     filmed = min(episodes, NUM_FILMED)
     if hasattr(envs, "layout"):
         plot_trajectories(
@@ -134,9 +135,9 @@ def main(
             continue
         plot_calibration(bins, out / f"calibration{suffix}.png")
         for name in ("mean", "cvar"):
-            error = bins[f"predicted_{name}"] - bins[f"realised_{name}"]
-            metrics[f"calibration{suffix}/{name}_bias"] = error.mean().item()
-            metrics[f"calibration{suffix}/{name}_error"] = error.abs().mean().item()
+            bias = bins[f"predicted_{name}"] - bins[f"realised_{name}"]
+            metrics[f"calibration{suffix}/{name}_bias"] = bias.mean().item()
+            metrics[f"calibration{suffix}/{name}_error"] = bias.abs().mean().item()
     write_results(out / "results.json", {**metrics, "episodes": episodes_played})
     say(format_table(metrics))
     envs.close()
@@ -186,10 +187,11 @@ def load(options: MethodOptions, checkpoint: Path, make: Callable[..., EnvBase])
     return Subject(options, policy, trainer.cost_losses)
 
 
-def shares(episodes: TensorDictBase, prefix: str) -> dict[str, float]:
-    """How many episodes met a goal, and how many violated, each with its 95 % interval."""
-    metrics = {}
-    for name, met in (("success", episodes["goals"] > 0), ("failure", episodes["violations"] > 0)):
+def shares(episodes: TensorDictBase, prefix: str, goals: bool) -> dict[str, float]:
+    """How many episodes violated and, of goals, met one, each with its 95 % interval."""
+    metrics: dict[str, float] = {}
+    outcomes = {"success": episodes["goals"] > 0} if goals else {}
+    for name, met in {**outcomes, "failure": episodes["violations"] > 0}.items():
         count, total = int(met.sum()), met.numel()
         low, high = proportion_interval(count, total)
         metrics |= {

@@ -284,7 +284,7 @@ class TestMisuse:
         [
             ("loss.cost_limt=1", "cost_limt"),
             ("+loss.cost_limt=1", "cost_limt is not an option; there are loss.cost_limit"),
-            ("loss.cost_limit=-1", r"cost_limit must be a number in \[0, inf\), got -1"),
+            ("loss.cost_limit=-1", r"cost_limit must be a number in \[0, inf\), .*, got -1"),
             ("env.robot=unicycle", "unicycle"),
             ("replay_buffer.storage=disk", "storage must be one of 'memory', 'memmap', got 'disk'"),
         ],

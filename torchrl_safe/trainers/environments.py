@@ -215,11 +215,15 @@ def source_of(env: EnvBase | MakeEnv) -> tuple[MakeEnv, int | None]:
 
 
 def _make_gym(options: MethodOptions) -> EnvBase:
+    from gymnasium.error import Error
     from torchrl.envs import GymEnv
 
     from torchrl_safe.envs.transforms import CostFunction
 
-    env = GymEnv(options.env.id, device=options.device)
+    try:
+        env = GymEnv(options.env.id, device=options.device)
+    except Error as error:
+        raise ValueError(f"env.id={options.env.id}: {error}") from error
     if options.env.cost is None:
         return env
     return TransformedEnv(env, CostFunction(imported("env.cost", options.env.cost)))

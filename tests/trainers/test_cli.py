@@ -100,7 +100,7 @@ def test_failure_of_somebodys_function_is_shown_with_its_place(tmp_path, monkeyp
     monkeypatch.syspath_prepend(tmp_path)
     with pytest.raises(SystemExit):
         cli.train("cpo", ["env=torn:make"])
-    assert "torn.py\", line 2, in make" in capsys.readouterr().err
+    assert 'torn.py", line 2, in make' in capsys.readouterr().err
 
 
 def test_unknown_method(capsys):

@@ -26,6 +26,8 @@ def log_full_run(logger, num_points=40):
         step = 25_000 * (i + 1)
         rise = 1 - math.exp(-i / 12)
         values = {
+            "eval/return": 9 + 3 * rise + 0.4 * rng.normal(),
+            "eval/det/return": 9 + 4 * rise + 0.4 * rng.normal(),
             "eval/score": 9 * rise + 0.4 * rng.normal(),
             "eval/det/score": 10.5 * rise + 0.4 * rng.normal(),
             "eval/cv_rate": 0.03 * (1 - rise) + 0.004 * rng.uniform(),
@@ -131,9 +133,10 @@ def test_full_run(run, tmp_path, draw):
     log_full_run(run)
     path, lines, texts = draw(run_dir(run))
     assert path == tmp_path / "pictures/curves.png"
-    assert texts == [[], [], []]
+    assert texts == [[], [], [], []]
     metrics = read_metrics(run_dir(run))
     expected = [
+        {"sampled action": "eval/return", "deterministic action": "eval/det/return"},
         {"sampled action": "eval/score", "deterministic action": "eval/det/score"},
         {
             "training": "train/cv_rate",
@@ -150,10 +153,10 @@ def test_full_run(run, tmp_path, draw):
         # Told apart without colour, too.
         styles = {(line.get_linestyle(), line.get_linewidth()) for line in panel.values()}
         assert len(styles) == len(panel)
-    assert lines[2]["limit"].get_linestyle() == "--"
+    assert lines[3]["limit"].get_linestyle() == "--"
 
     picture = imageio.imread(path)[..., :3].astype(int)
-    assert picture.shape == (570, 1950, 3)
+    assert picture.shape == (570, 2550, 3)
     for colour in ((0, 114, 178), (213, 94, 0), (153, 153, 153), (0, 0, 0)):
         assert (np.abs(picture - colour).max(-1) < 20).sum() > 300, colour
 
@@ -179,17 +182,17 @@ def test_values_that_are_not_numbers_leave_gaps(run, draw):
         for step, value in ((10, math.nan), (20, math.inf if "update" in name else math.nan)):
             run.log_scalar(name, value, step=step)
     _, lines, _ = draw(run_dir(run))
-    assert np.isnan(lines[0]["sampled action"].get_ydata()).all()
+    assert np.isnan(lines[1]["sampled action"].get_ydata()).all()
 
 
 @pytest.mark.parametrize(
     ("logged", "panel"),
     [
         (None, None),
-        ("eval/score", 0),
-        ("eval/det/score", 0),
-        ("train/cv_rate", 1),
-        ("update/cost_level", 2),
+        ("eval/return", 0),
+        ("eval/det/score", 1),
+        ("train/cv_rate", 2),
+        ("update/cost_level", 3),
         # A limit with no estimate to compare it with is nothing to look at.
         ("update/cost_limit", None),
         ("update/kl", None),
@@ -199,7 +202,7 @@ def test_young_runs(run, draw, logged, panel):
     if logged:
         run.log_scalar(logged, 2.0, step=100)
     path, lines, texts = draw(run_dir(run))
-    for i in range(3):
+    for i in range(4):
         assert bool(lines[i]) == (i == panel)
         assert texts[i] == ([] if i == panel else ["no data yet"])
         # A single point is a line without length.

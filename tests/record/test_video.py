@@ -246,6 +246,28 @@ def test_grid(tmp_path):
             assert np.abs(tile - grey).max() <= 4  # compression
 
 
+@pytest.mark.parametrize("num_envs", [None, 3])
+def test_environments_that_draw_as_gymnasium_does(tmp_path, num_envs):
+    """Pictures 12 wide and 6 high in tiles of 64 by 64: 32 high, in the middle, white around."""
+
+    class Drawn(FilmedEnv):
+        def render(self):
+            pictures = [np.full((6, 12, 3), 60 + 40 * n, np.uint8) for n in range(num_envs or 1)]
+            return pictures if num_envs else pictures[0]
+
+    env = Drawn(num_envs=num_envs or 1)
+    index = [2, 0] if num_envs else [0]
+    path = record_video(
+        env, policy, tmp_path / "a.mp4", num_steps=4, width=64, height=64, index=index
+    )
+    raw = ffmpeg("-i", str(path), "-f", "rawvideo", "-pix_fmt", "rgb24", "-").stdout
+    frame = np.frombuffer(raw, np.uint8).reshape(2, 64, 64 * len(index), 3)[0].astype(int)
+    for tile, number in enumerate(index):
+        column = frame[:, 64 * tile + 32, 0]
+        assert np.abs(column[20:44] - (60 + 40 * number)).max() <= 8  # compression
+        assert column[[0, 8, 55, 63]].min() >= 245
+
+
 @pytest.mark.parametrize("index", [[], [0, 2]])
 def test_grid_of_impossible_environments(tmp_path, index):
     with pytest.raises(ValueError, match="index must"):

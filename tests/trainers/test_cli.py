@@ -72,6 +72,37 @@ def test_what_cannot_be_done(tmp_path, monkeypatch, words, match):
         cli.main(words)
 
 
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["env=gym"], "env.id must name an environment for env=gym, got null."),
+        (["env=gym", "env.id=Pendulum-v1"], "must have a cost 'cost' beside the reward"),
+        (["env=gym", "env.id=Pendulm-v1"], "env.id=Pendulm-v1: Environment `Pendulm` doesn't"),
+        (["env=gym", "env.id=Pendulum-v1", "env.cost=mine:speed"], "No module named 'mine'"),
+        (["loss.cost_limit=-1"], "loss.cost_limit must be a number in [0, inf)"),
+        (["resume=true"], "holds no run to resume from"),
+        (["loss.cost_limt=1"], "Key 'cost_limt' is not in struct"),
+    ],
+)
+def test_what_cannot_be_trained(tmp_path, monkeypatch, capsys, words, message):
+    """A message, and no trace through the library."""
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SystemExit):
+        cli.train("cpo", words)
+    said = capsys.readouterr().err
+    assert message in said
+    assert "Traceback" not in said
+
+
+def test_failure_of_somebodys_function_is_shown_with_its_place(tmp_path, monkeypatch, capsys):
+    (tmp_path / "torn.py").write_text("def make():\n    raise ValueError('torn')\n")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(tmp_path)
+    with pytest.raises(SystemExit):
+        cli.train("cpo", ["env=torn:make"])
+    assert 'torn.py", line 2, in make' in capsys.readouterr().err
+
+
 def test_unknown_method(capsys):
     with pytest.raises(SystemExit):
         cli.main(["train", "ppo"])

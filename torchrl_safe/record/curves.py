@@ -80,10 +80,10 @@ def read_metrics(run_dir: str | os.PathLike[str]) -> dict[str, tuple[np.ndarray,
 
 
 def plot_learning_curves(run_dir: str | os.PathLike[str], path: str | os.PathLike[str]) -> Path:
-    """Draws score, violation rate and the constraint of a run over environment steps.
+    """Draws return, score, violation rate and the constraint of a run over environment steps.
 
-    The metrics drawn are ``score`` and ``cv_rate`` under ``eval/`` (sampled actions) and
-    ``eval/det/`` (deterministic), with the interval ``score_low``, ``score_high`` shaded;
+    The metrics drawn are ``return``, ``score`` and ``cv_rate`` under ``eval/`` (sampled actions)
+    and ``eval/det/`` (deterministic), with the interval ``score_low``, ``score_high`` shaded;
     ``train/cv_rate``; ``update/cost_level`` and ``update/cost_limit``, of several costs each under
     its name. Those a run has not logged are left out, and a panel with none of its own says so.
 
@@ -110,8 +110,12 @@ def plot_learning_curves(run_dir: str | os.PathLike[str], path: str | os.PathLik
     from matplotlib.ticker import EngFormatter
 
     metrics = read_metrics(run_dir)
-    figure = Figure(figsize=(13, 3.8), layout=ConstrainedLayoutEngine(w_pad=0.1))
-    score, violations, constraint = figure.subplots(1, 3)
+    figure = Figure(figsize=(17, 3.8), layout=ConstrainedLayoutEngine(w_pad=0.1))
+    returns, score, violations, constraint = figure.subplots(1, 4)
+
+    returns.set(title="Return", ylabel="sum of rewards, per episode")
+    _draw(returns, metrics, "eval/return", "sampled action", color=_BLUE)
+    _draw(returns, metrics, "eval/det/return", "deterministic action", color=_VERMILLION, ls="-.")
 
     score.set(title="Score", ylabel="return / (1 + violations), per episode")
     for prefix, colour in (("eval/", _BLUE), ("eval/det/", _VERMILLION)):
@@ -136,7 +140,7 @@ def plot_learning_curves(run_dir: str | os.PathLike[str], path: str | os.PathLik
             limit = f"update/cost_limit{cost}"
             _draw(constraint, metrics, limit, f"limit{name}", color=black, ls="--")
 
-    for axes in (score, violations, constraint):
+    for axes in (returns, score, violations, constraint):
         axes.set_xlabel("environment steps")
         axes.spines[["top", "right"]].set_visible(False)
         if axes.lines:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import inspect
 import math
 import os
 from collections.abc import Callable, Sequence
 from contextlib import closing
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -44,7 +46,8 @@ def record_video(
 
     Args:
         env (EnvBase): with ``render(index=..., width=..., height=...)`` that returns a uint8
-            array [height, width, 3].
+            array [height, width, 3]. Or of Gymnasium, made with ``render_mode="rgb_array"``: its
+            pictures are scaled to fit.
         policy (callable): from tensordict to tensordict with the action.
         path (path): the ``.mp4`` to write. Missing parent directories are made.
 
@@ -90,12 +93,15 @@ def record_video(
         if not 0 <= i < env.batch_size.numel():
             raise ValueError(f"index must be in [0, {env.batch_size.numel()}), got {i}.")
 
-    def picture(index: int) -> np.ndarray:
+    def pictures(indices: Sequence[int]) -> dict[int, np.ndarray]:
         try:
-            image = env.render(index=index, width=width, height=height)
-            if image.shape != (height, width, 3) or image.dtype != np.uint8:
-                raise ValueError(f"got {image.dtype} {image.shape}, not uint8 [height, width, 3]")
-            return image
+            images = _render(env, indices, width, height)
+            for image in images.values():
+                if image.shape != (height, width, 3) or image.dtype != np.uint8:
+                    raise ValueError(
+                        f"got {image.dtype} {image.shape}, not uint8 [height, width, 3]"
+                    )
+            return images
         except Exception as error:
             raise RuntimeError(
                 f"the environment could not render ({type(error).__name__}: {error}); without a "
@@ -126,7 +132,7 @@ def record_video(
             running = set(filmed)
             for step in range(num_steps):
                 if step % every == 0:
-                    tiles |= {i: picture(i) for i in filmed if i in running}
+                    tiles |= pictures([i for i in filmed if i in running])
                     writer.append_data(_grid([tiles[i] for i in filmed]))
                 stepped, td = env.step_and_maybe_reset(policy(td))
                 done = stepped["next", "done"].flatten()
@@ -134,6 +140,25 @@ def record_video(
                 if not running:
                     break
     return path
+
+
+def _render(env: EnvBase, indices: Sequence[int], width: int, height: int) -> dict[int, np.ndarray]:
+    if "index" in inspect.signature(env.render).parameters:
+        return {i: env.render(index=i, width=width, height=height) for i in indices}
+    drawn: Any = env.render()  # of a batch, a list
+    if not isinstance(drawn, list | tuple):
+        drawn = [drawn]
+    return {i: _fitted(np.asarray(drawn[i]), width, height) for i in indices}
+
+
+def _fitted(image: np.ndarray, width: int, height: int) -> np.ndarray:
+    """A picture in the middle of a white one of another size."""
+    scale = min(height / image.shape[0], width / image.shape[1])
+    rows, columns = ((np.arange(int(scale * size)) / scale).astype(int) for size in image.shape[:2])
+    fitted = np.full((height, width, 3), 255, image.dtype)
+    top, left = (height - len(rows)) // 2, (width - len(columns)) // 2
+    fitted[top : top + len(rows), left : left + len(columns)] = image[rows][:, columns]
+    return fitted
 
 
 def _grid(tiles: list[np.ndarray]) -> np.ndarray:

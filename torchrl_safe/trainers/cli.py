@@ -15,6 +15,7 @@ import argparse
 import os
 import re
 import sys
+import traceback
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -22,12 +23,15 @@ import hydra
 from hydra.core.config_store import ConfigStore
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.errors import CompactHydraException
 from omegaconf import DictConfig, OmegaConf
 from torchrl.checkpoint import CheckpointError
 
 from torchrl_safe.trainers.commands import evaluate, export, play, watch
 from torchrl_safe.trainers.methods import METHODS
 from torchrl_safe.trainers.options import Options, flat
+
+CANNOT = (CheckpointError, ModuleNotFoundError, OSError, ValueError)  # with what to do about it
 
 # Hydra itself writes no folder and no log: run_dir has everything.
 HYDRA = {
@@ -77,7 +81,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         return
     try:
         COMMANDS[command].main(**given)
-    except (CheckpointError, ModuleNotFoundError, OSError, ValueError) as error:
+    except CANNOT as error:
         sys.exit(f"torchrl-safe {command}: {error}")
 
 
@@ -113,7 +117,13 @@ def run(
     name = register(method, **defaults)
 
     def main(cfg: DictConfig) -> None:
-        go(options_of(method, cfg, **defaults))
+        try:
+            go(options_of(method, cfg, **defaults))
+        except CANNOT as error:
+            if not _is_ours(error):
+                raise
+            # Of which hydra shows the message alone, and with HYDRA_FULL_ERROR=1 everything.
+            raise CompactHydraException(f"torchrl-safe train: {error}") from error
 
     arguments = sys.argv[1:] if arguments is None else arguments
     before, sys.argv = sys.argv, [sys.argv[0], *map(spelled_out, arguments)]
@@ -173,6 +183,12 @@ def options_of(
 def spelled_out(argument: str) -> str:
     """``env=gym`` is short for ``env.name=gym``."""
     return re.sub(r"^(\+*)env=(?!\{)", r"\1env.name=", argument)
+
+
+def _is_ours(error: BaseException) -> bool:
+    """Whether the library raised it: its messages say all; of others one wants the place."""
+    *_, (frame, _) = traceback.walk_tb(error.__traceback__)
+    return frame.f_globals["__name__"].startswith("torchrl_safe.")
 
 
 def _leaves(values: Any, standard: Any, prefix: str = "") -> list[tuple[str, Any]]:

@@ -135,7 +135,7 @@ def _make_env(
             **how,
         )
     if name == "gym":
-        env = _batched(lambda: _make_gym(options), num_envs, seed)
+        env = _batched(_gym_maker(options), num_envs, seed)
         if training:
             env = TransformedEnv(env, StepCounter(max_steps=options.env.episode_length))
         return _completed(env, options)
@@ -214,15 +214,27 @@ def source_of(env: EnvBase | MakeEnv) -> tuple[MakeEnv, int | None]:
     return lambda: copy.deepcopy(pristine), env.batch_size.numel() if env.batch_size else None
 
 
-def _make_gym(options: MethodOptions) -> EnvBase:
+def _gym_maker(options: MethodOptions) -> MakeEnv:
+    """Makes the environment of ``env.id``, so that it can be filmed if it can draw."""
+    from gymnasium.error import Error
     from torchrl.envs import GymEnv
 
     from torchrl_safe.envs.transforms import CostFunction
 
-    env = GymEnv(options.env.id, device=options.device)
-    if options.env.cost is None:
-        return env
-    return TransformedEnv(env, CostFunction(imported("env.cost", options.env.cost)))
+    cost = None if options.env.cost is None else imported("env.cost", options.env.cost)
+    try:
+        env = GymEnv(options.env.id, device=options.device)
+    except Error as error:
+        raise ValueError(f"env.id={options.env.id}: {error}") from error
+    draws = "rgb_array" in (env.metadata.get("render_modes") or ())
+    env.close()
+    how = {"render_mode": "rgb_array"} if draws else {}
+
+    def make() -> EnvBase:
+        env = GymEnv(options.env.id, device=options.device, **how)
+        return env if cost is None else TransformedEnv(env, CostFunction(cost))
+
+    return make
 
 
 def _batched(make: MakeEnv, num_envs: int, seed: int) -> EnvBase:

@@ -16,6 +16,7 @@ from torchrl.checkpoint import GlobalRNGState
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType
 
+from torchrl_safe._costs import costs_among
 from torchrl_safe._files import (
     JSON_LIMIT,
     expand,
@@ -315,7 +316,7 @@ class Run:
             self._without_curves = True
 
     def finish(self, env: EnvBase, policy: Callable[[TensorDictBase], TensorDictBase]) -> None:
-        """Final evaluation, table, curves and video."""
+        """Final evaluation, table and curves."""
         played = self._play(env, policy, "final evaluation")
         metrics = {
             k: v for prefix, each in played.items() for k, v in summarize(each, prefix).items()
@@ -336,6 +337,12 @@ class Run:
             f"score, deterministic ({env.batch_size.numel()} episodes)": metrics["eval/det/score"],
             "score, sampled": metrics["eval/score"],
             "return, deterministic": metrics["eval/det/return"],
+            **{
+                f"{cost} per episode, {kind}": metrics[prefix + cost]
+                for cost in costs_among(played["eval/"].keys())
+                if not cost.endswith("discounted_cost")
+                for kind, prefix in (("deterministic", "eval/det/"), ("sampled", "eval/"))
+            },
             "CV per step, deterministic": metrics["eval/det/cv_rate"],
             "CV per step, sampled": metrics["eval/cv_rate"],
             "total CVs in training": str(self.counters["total_cvs"]),
@@ -343,15 +350,21 @@ class Run:
             "frames/s": results["frames_per_second"],
         }
         say(format_table(rows))
-        if self.options.video.num_steps:
-            try:
-                path = record_video(
-                    env, policy, self.path / "video.mp4", num_steps=self.options.video.num_steps
-                )
-                say(f"video: {path}")
-            except Exception as error:  # whatever it is, the results are written
-                say(f"no video: {error}")
         say(f"results: {self.path}")
+
+    def film(
+        self, make_env: Callable[[], EnvBase], policy: Callable[[TensorDictBase], TensorDictBase]
+    ) -> None:
+        """The film at the end, of an environment of its own."""
+        try:
+            env = make_env()
+            path = record_video(
+                env, policy, self.path / "video.mp4", num_steps=self.options.video.num_steps
+            )
+            env.close()
+            say(f"video: {path}")
+        except Exception as error:  # whatever it is, the results are written
+            say(f"no video: {error}")
 
 
 def cost_gamma(options: Any) -> float:

@@ -212,9 +212,12 @@ class Trainer(ABC):
         if stop.requested:
             say(f"stopped at {run.frames} frames; go on with the same command and resume=true")
             return
-        final_env = self.make_env(options.eval.final_episodes, stream_seed("final evaluation"))
+        seed = stream_seed("final evaluation")
+        final_env = self.make_env(options.eval.final_episodes, seed)
         run.finish(final_env, self.policy)
-        final_env.close()
+        final_env.close(raise_if_closed=False)
+        if options.video.num_steps:  # of one, as those of others draw all of a batch
+            run.film(partial(self.make_env, self._width or 1, seed), self.policy)
 
     def _loop(
         self, run: Run, collector: BaseCollector, eval_env: EnvBase, stop: GracefulStop

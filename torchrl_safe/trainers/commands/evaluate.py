@@ -173,7 +173,7 @@ class Subject(NamedTuple):
 
     options: MethodOptions
     policy: Policy
-    cost_losses: dict[str, CVaRCostLoss]
+    cost_losses: Mapping[str, CVaRCostLoss | QuantileCostLoss]
 
 
 def load(options: MethodOptions, checkpoint: Path, make: Callable[..., EnvBase]) -> Subject:

@@ -46,6 +46,7 @@ def test_somebodys_environment_from_training_to_its_evaluation(tmp_path):
     refused = command(tmp_path, "evaluate", "run", "--episodes", "2", "--no-film")
     assert refused.returncode == 1
     assert "names code, env.cost=mine:speed" in refused.stderr
+    assert "--trust" in refused.stderr
     assert "Traceback" not in refused.stderr
     done = command(tmp_path, "evaluate", "run", "--episodes", "2", "--no-film", "--trust")
     assert done.returncode == 0, done.stderr

@@ -73,6 +73,17 @@ class TestCommandLine:
         assert logged["update/cost_level"] == pytest.approx([20 * r for r in rates], rel=1e-5)
         assert logged["train/cv_rate"] == pytest.approx(rates)  # a bool: what costs, violates
 
+    def test_gym_can_be_filmed(self, tmp_path):
+        """Each of a batch draws itself; the pictures are pygame's."""
+        pytest.importorskip("pygame")
+        cost = f"env.cost={__name__}:speed"
+        options = small.options("cpo", "env=gym", "env.id=Pendulum-v1", cost, run_dir=tmp_path)
+        env = make_env(options, 2, 0)
+        env.reset()
+        first, second = env.render()
+        assert first.shape == (500, 500, 3)
+        assert (first != second).any()  # another angle
+
     def test_function_of_a_module_is_not_imported_for_strangers(self, tmp_path):
         run_dir = tmp_path / "run"
         options = small.options("wcsac", f"env={__name__}:pendulum", run_dir=run_dir)

@@ -91,8 +91,8 @@ def _make_env(
     name, device = options.env.name, options.device
     if source is None and not trust and (code := names_code(options)) is not None:
         raise UntrustedError(
-            f"the configuration names code, {code}: pass the environment itself, or say that you "
-            "trust it."
+            f"the configuration names code, {code}: pass the environment itself (env, or --env "
+            "module:function), or say that you trust it (trust=True, or --trust)."
         )
     if source is not None:
         return _completed(_batched(source, num_envs, seed), options)

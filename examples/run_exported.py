@@ -19,7 +19,7 @@ import torch
 from numpy.typing import NDArray
 
 from torchrl_safe._files import expand, printable
-from torchrl_safe.envs import SafeGoalEnv
+from torchrl_safe.envs import SafeRobotEnv
 
 Controller = Callable[[NDArray[np.float32]], NDArray[np.float32]]
 
@@ -48,7 +48,7 @@ def load(path: Path) -> Controller:
 def main(path: Path, robot: str, steps: int, seed: int) -> tuple[int, int]:
     """Drive one episode, and return how many goals were met and how many steps violated."""
     act = load(path)
-    env = SafeGoalEnv(robot, num_envs=1, num_threads=1, seed=seed, episode_length=steps)
+    env = SafeRobotEnv(robot, num_envs=1, num_threads=1, seed=seed, episode_length=steps)
     td = env.reset()
     goals = violations = 0
     for _ in range(steps):

@@ -77,13 +77,16 @@ def make_critic(
     out_key: str,
     *last: nn.Module,
     of_actions: bool = True,
+    num_outputs: int = 1,
     in_keys: Sequence[str] = ("observation",),
     network: MakeNetwork | None = None,
 ) -> ValueOperator:
     """A critic of observation and, by default, action; ``last`` goes behind its linear output."""
     keys = [*in_keys, *(["action"] if of_actions else [])]
     inputs = [env.action_spec if key == "action" else env.observation_spec[key] for key in keys]
-    module = _make(inputs, 1, options.critic.num_cells, options.device, network, inplace=True)
+    module = _make(
+        inputs, num_outputs, options.critic.num_cells, options.device, network, inplace=True
+    )
     if last:
         module = module.extend(last) if isinstance(module, MLP) else nn.Sequential(module, *last)
     return ValueOperator(module, in_keys=keys, out_keys=[out_key])

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import CudaGraphModule
 from torch import Tensor, nn
 from torchrl._utils import timeit
@@ -114,12 +114,10 @@ def critic_losses(
     cost_losses: Mapping[str, CVaRCostLoss],
 ) -> TensorDictBase:
     """Losses of all critics, and their mean predictions of costs."""
-    losses, *others = (
-        loss(minibatch) if len(cost_losses) == 1 else _renamed(trainer, cost, loss(minibatch))
-        for cost, loss in cost_losses.items()
-    )
-    for other in others:
-        losses.update(other)
+    losses = TensorDict()
+    for cost, loss in cost_losses.items():
+        own = loss(minibatch)
+        losses.update(own if len(cost_losses) == 1 else _renamed(trainer, cost, own))
     losses["loss_qvalue"], _ = reward_loss.qvalue_v2_loss(minibatch)
     return losses
 

@@ -12,9 +12,10 @@ from torch import Tensor
 from torchrl._utils import timeit
 from torchrl.envs import EnvBase
 
-from torchrl_safe import CVaRCostLoss
 from torchrl_safe.modules import DISTANCES, Distance
+from torchrl_safe.objectives import CVaRCostLoss, QuantileCostLoss
 from torchrl_safe.optim import FiniteSteps
+from torchrl_safe.trainers.cost_sums import CostSums, SafetyCritic, make_quantile_losses
 from torchrl_safe.trainers.off_policy import (
     CriticFit,
     CriticSteps,
@@ -106,6 +107,7 @@ class SafeTACOptions(MethodOptions):
     replay_buffer: SliceBuffer = Field(default_factory=SliceBuffer)
     policy: SafeTACPolicy = Field(default_factory=SafeTACPolicy)
     loss: SafeTACLoss = Field(default_factory=SafeTACLoss)
+    safety_critic: SafetyCritic = Field(default_factory=SafetyCritic)
     optim: SafeTACOptim = Field(default_factory=SafeTACOptim)
     lagrangian: SafeTACLagrangian = Field(default_factory=SafeTACLagrangian)
     pid: PID = Field(default_factory=PID)
@@ -125,6 +127,9 @@ class SafeTAC(ConstrainedTrainer):
 
     Options = SafeTACOptions
 
+    cost_losses: Mapping[str, CVaRCostLoss | QuantileCostLoss]
+    cost_sums: CostSums | None = None
+
     def build(self, env: EnvBase) -> dict[str, Any]:
         """A policy, critics of reward and costs, and the trust region."""
         options = self.options
@@ -133,15 +138,23 @@ class SafeTAC(ConstrainedTrainer):
         self.reward_loss.make_value_estimator(
             "retrace", gamma=options.loss.gamma, lmbda=options.loss.lmbda
         )
-        self.cost_losses = make_cost_losses(self, env, variance_reward=options.loss.variance_reward)
-        for loss in self.cost_losses.values():
-            loss.make_value_estimator(gamma=options.loss.cost_gamma, lmbda=options.loss.lmbda)
-        critic_optim = make_critic_optim(self, self.reward_loss, self.cost_losses)
+        components: dict[str, Any] = {}
+        replay_losses: dict[str, CVaRCostLoss] = {}  # of the costs, those that learn from replay
+        if options.safety_critic.kind == "quantiles":
+            self.cost_losses = make_quantile_losses(self, env)
+            self.cost_sums = components["cost_sums"] = CostSums(self, self.cost_losses)
+        else:
+            variance_reward = options.loss.variance_reward
+            replay_losses = make_cost_losses(self, env, variance_reward=variance_reward)
+            for loss in replay_losses.values():
+                loss.make_value_estimator(gamma=options.loss.cost_gamma, lmbda=options.loss.lmbda)
+            self.cost_losses = replay_losses
+        critic_optim = make_critic_optim(self, self.reward_loss, replay_losses)
         self.buffer = make_slice_buffer(self)
         self.fit_critics = CriticFit(
-            self, self.buffer, self.reward_loss, self.cost_losses, critic_optim
+            self, self.buffer, self.reward_loss, replay_losses, critic_optim
         )
-        components = {
+        components |= {
             "reward_loss": self.reward_loss,
             **as_components(self, "cost_loss", self.cost_losses),
             "critic_optim": critic_optim,
@@ -169,9 +182,13 @@ class SafeTAC(ConstrainedTrainer):
     def update(self, batch: TensorDictBase) -> dict[str, float]:
         """Algorithm 1: critics on replayed slices, then the policy on the new states."""
         self.buffer.extend(batch.select(*replayed(self)))
+        if self.cost_sums is not None:
+            self.cost_sums.extend(batch)
         if self.frames < self.options.collector.init_frames:
             return {}
         metrics = self.fit_critics()
+        if self.cost_sums is not None:
+            metrics |= self.cost_sums.fit()
         with timeit("time/policy"):
             step = self._step if self.options.update == "trust_region" else self._ascend
             return step(batch, metrics)
@@ -224,7 +241,7 @@ class SafeTAC(ConstrainedTrainer):
                 for name, loss in losses.items():
                     measured[name] = loss.measure(batch, action, states=states)
 
-        def constraint(name: str, loss: CVaRCostLoss, action: Tensor) -> Tensor:
+        def constraint(name: str, loss: CVaRCostLoss | QuantileCostLoss, action: Tensor) -> Tensor:
             if batch is None:
                 return loss.cvar(states, action).mean() - limits[name]
             return loss.constraint(states, action, measured[name], cost_limit=limits[name])

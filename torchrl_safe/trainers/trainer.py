@@ -129,16 +129,14 @@ class Trainer(ABC):
             )
         return make_policy(self.options, env, in_keys=self.in_keys, network=self.network)
 
-    def make_critic(
-        self, env: EnvBase, out_key: str, *last: nn.Module, of_actions: bool = True
-    ) -> Any:
+    def make_critic(self, env: EnvBase, out_key: str, *last: nn.Module, **how: Any) -> Any:
         """A critic, see :func:`~torchrl_safe.trainers.networks.make_critic`."""
         return make_critic(
             self.options,
             env,
             out_key,
             *last,
-            of_actions=of_actions,
+            **how,
             in_keys=self.in_keys,
             network=self.network,
         )

@@ -13,7 +13,7 @@ The map is drawn where there is one, goals are counted where there are any.
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple
@@ -26,6 +26,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl_safe import CVaRCostLoss
 from torchrl_safe._files import expand, make_folder, printable
 from torchrl_safe.envs import RANDOMIZATIONS
+from torchrl_safe.objectives import QuantileCostLoss
 from torchrl_safe.record import (
     calibrate,
     describe,
@@ -173,7 +174,7 @@ class Subject(NamedTuple):
 
     options: MethodOptions
     policy: Policy
-    cost_losses: dict[str, CVaRCostLoss]
+    cost_losses: Mapping[str, CVaRCostLoss | QuantileCostLoss]
 
 
 def load(options: MethodOptions, checkpoint: Path, make: Callable[..., EnvBase]) -> Subject:
@@ -203,7 +204,11 @@ def shares(episodes: TensorDictBase, prefix: str, goals: bool) -> dict[str, floa
 
 
 def calibration(
-    env: EnvBase, policy: Policy, cost_loss: CVaRCostLoss, num_steps: int, seed: int
+    env: EnvBase,
+    policy: Policy,
+    cost_loss: CVaRCostLoss | QuantileCostLoss,
+    num_steps: int,
+    seed: int,
 ) -> TensorDictBase:
     """The critics' predictions beside realised cost sums, under the policy they describe."""
     with torch.no_grad(), set_exploration_type(ExplorationType.RANDOM):

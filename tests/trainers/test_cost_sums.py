@@ -1,0 +1,123 @@
+"""Critics of quantiles in training: what they learn from, what they learn, what a run keeps."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import tiny
+import torch
+from tensordict import TensorDict
+
+from torchrl_safe import record
+from torchrl_safe.trainers import SafeTAC
+from torchrl_safe.trainers.cost_sums import CostSums
+
+QUANTILES = ("safety_critic.kind=quantiles", "safety_critic.num_updates=5")
+N = 64  # environments
+
+
+@pytest.fixture
+def trainer():
+    torch.manual_seed(0)
+    trainer = SafeTAC(
+        options=tiny.options("unused", *QUANTILES, "critic.num_cells=[32]").changed(
+            **{
+                "safety_critic.window": 6,
+                "safety_critic.num_updates": 200,
+                "safety_critic.num_quantiles": 64,
+                "optim.minibatch_size": 64,
+                "optim.critic_lr": 1e-2,
+            }
+        )
+    )
+    trainer.build(trainer.make_env(1, seed=0))
+    return trainer
+
+
+def steps(cost: torch.Tensor, episode: int = 0, ends: bool = False) -> TensorDict:
+    """Steps ``[N, T]`` of equal states, with the given costs."""
+    shape = cost.shape
+    flag = torch.zeros(*shape, 1, dtype=torch.bool)
+    return TensorDict(
+        {
+            "observation": torch.zeros(*shape, 24),
+            "action": torch.zeros(*shape, 2),
+            "collector": {"traj_ids": torch.full(shape, episode)},
+            "next": {
+                "observation": torch.zeros(*shape, 24),
+                "cost": cost.unsqueeze(-1),
+                "done": flag | ends,
+                "terminated": flag | ends,
+            },
+        },
+        batch_size=shape,
+    )
+
+
+class TestWindow:
+    def test_keeps_the_newest_in_order(self, trainer):
+        sums = trainer.cost_sums
+        costs = torch.arange(12.0).expand(N, 12)
+        for part in costs.split(4, 1):
+            sums.extend(steps(part))
+        assert sums.steps["next", "cost"].squeeze(-1).equal(costs[:, -6:])
+
+    def test_episodes_do_not_run_into_one_another(self, trainer):
+        """As where a resumed run of several processes goes on with new layouts."""
+        sums = trainer.cost_sums
+        sums.extend(steps(torch.zeros(N, 3), episode=0))
+        sums.extend(steps(torch.ones(N, 3), episode=1))
+        rows = sums.rows()
+        assert rows["next", "done"][0, :, 0].tolist() == [False, False, True, False, False, False]
+        assert not rows["next", "terminated"].any()
+        assert not sums.steps["next", "done"].any()  # what is kept is as it was
+
+    def test_another_width(self, trainer):
+        trainer.cost_sums.extend(steps(torch.zeros(N, 3)))
+        with pytest.raises(ValueError, match=r"all environments in every batch, got 2 after 64"):
+            trainer.cost_sums.extend(steps(torch.zeros(2, 3)))
+
+    def test_nothing_yet(self, trainer):
+        with pytest.raises(RuntimeError, match="extend must be called before"):
+            trainer.cost_sums.fit()
+
+    def test_state(self, trainer):
+        sums = trainer.cost_sums
+        sums.extend(steps(torch.rand(N, 6)))
+        sums.fit()
+        other = CostSums(trainer, trainer.cost_losses)
+        other.load_state_dict(sums.state_dict())
+        assert (other.steps == sums.steps).all()
+        torch.testing.assert_close(other.optim.state_dict(), sums.optim.state_dict())
+        empty = CostSums(trainer, trainer.cost_losses)
+        empty.load_state_dict(CostSums(trainer, trainer.cost_losses).state_dict())
+        assert empty.steps is None
+
+
+def test_learns_the_distribution(trainer):
+    """Episodes of one step that cost 8 with probability .1: mean .8, the worst eighth 6.4."""
+    cost = 8.0 * (torch.arange(N * 6).reshape(N, 6) % 10 == 0)
+    trainer.cost_sums.extend(steps(cost, ends=True))
+    for _ in range(3):
+        metrics = trainer.cost_sums.fit()
+    (loss,) = trainer.cost_losses.values()
+    state = steps(torch.zeros(1, 1))[0]
+    mean, _ = loss.predict(state, state["action"])
+    risk = loss.cvar(state, state["action"])
+    assert mean.item() == pytest.approx(cost.mean().item(), abs=0.25)
+    assert risk.item() == pytest.approx(cost.mean().item() / 0.125, abs=0.7)
+    assert metrics["update/skipped_cost_steps"] == 0
+
+
+def test_continues_exactly(tmp_path):
+    """A run in two parts is the run in one, to the last bit."""
+    tiny.launch(tmp_path / "whole", *QUANTILES, "collector.total_frames=400")
+    tiny.launch(tmp_path / "parts", *QUANTILES, "collector.total_frames=200")
+    tiny.launch(tmp_path / "parts", *QUANTILES, "collector.total_frames=400", "resume=true")
+    whole, parts = (record.read_metrics(tmp_path / name / "log") for name in ("whole", "parts"))
+    assert "update/loss_cost_quantiles" in whole
+    assert "update/loss_cost_value" not in whole
+    for name in whole:
+        if name.startswith(("update/", "train/")):
+            for expected, got in zip(whole[name], parts[name], strict=True):
+                np.testing.assert_array_equal(got, expected, err_msg=name)

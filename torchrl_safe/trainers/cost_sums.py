@@ -118,10 +118,7 @@ class CostSums:
             for _ in range(options.safety_critic.num_updates):
                 size = (options.optim.minibatch_size,)
                 minibatch = data[torch.randint(len(data), size, device=data.device)]
-                losses: dict[str, Any] = {}
-                for cost, loss in self.losses.items():
-                    for name, value in loss(minibatch).items():
-                        losses[self.trainer.name_of(name, cost)] = value
+                losses = self.trainer.joined(self.losses, minibatch)
                 self._descent.step(losses)
         metrics = {f"update/{name}": value.item() for name, value in losses.items()}
         return metrics | {"update/skipped_cost_steps": float(self._descent.count())}

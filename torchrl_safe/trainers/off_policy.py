@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDictBase
 from tensordict.nn import CudaGraphModule
 from torch import Tensor, nn
 from torchrl._utils import timeit
@@ -114,17 +114,8 @@ def critic_losses(
     cost_losses: Mapping[str, CVaRCostLoss],
 ) -> TensorDictBase:
     """Losses of all critics, and their mean predictions of costs."""
-    losses = TensorDict()
-    for cost, loss in cost_losses.items():
-        own = loss(minibatch)
-        losses.update(own if len(cost_losses) == 1 else _renamed(trainer, cost, own))
+    losses = trainer.joined(cost_losses, minibatch)
     losses["loss_qvalue"], _ = reward_loss.qvalue_v2_loss(minibatch)
-    return losses
-
-
-def _renamed(trainer: ConstrainedTrainer, cost: str, losses: TensorDictBase) -> TensorDictBase:
-    for name in list(losses.keys()):
-        losses.rename_key_(name, trainer.name_of(name, cost))
     return losses
 
 

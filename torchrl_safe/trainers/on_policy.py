@@ -142,10 +142,7 @@ class SurrogateTrainer(ConstrainedTrainer):
     def fit_critics(self, data: TensorDictBase) -> dict[str, float]:
         """One pass of gradient steps over steps with their targets."""
         for minibatch in minibatches(data, self.options.optim.minibatch_size):
-            losses = TensorDict()
-            for cost, loss in self.cost_losses.items():
-                for name, value in loss(minibatch).items():
-                    losses[self.name_of(name, cost)] = value
+            losses = self.joined(self.cost_losses, minibatch)
             losses.update(self.reward_loss(minibatch))
             self.critic_steps.step(losses)
         metrics = {f"update/{name}": value.item() for name, value in losses.items()}

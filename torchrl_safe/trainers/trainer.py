@@ -12,13 +12,14 @@ from functools import partial
 from typing import Any, ClassVar
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictSequential
 from torch import Tensor, nn
 from torchrl._utils import logger as torchrl_logger
 from torchrl._utils import timeit
 from torchrl.collectors import BaseCollector
 from torchrl.envs import EnvBase
+from torchrl.objectives import LossModule
 
 from torchrl_safe.envs import ROBOTS
 from torchrl_safe.optim.trust_region import TrustRegionReport
@@ -320,6 +321,17 @@ class ConstrainedTrainer(Trainer):
     def named(self, metric: str, values: Mapping[str, float | Tensor]) -> dict[str, float]:
         """A metric of every cost: under its plain name if there is one cost."""
         return {self.name_of(metric, cost): float(value) for cost, value in values.items()}
+
+    def joined(self, losses: Mapping[str, LossModule], minibatch: TensorDictBase) -> TensorDict:
+        """What the losses of the costs return, told apart where there are several."""
+        joined = TensorDict()
+        for cost, loss in losses.items():
+            own = loss(minibatch)
+            if len(losses) > 1:
+                for name in list(own.keys()):
+                    own.rename_key_(name, self.name_of(name, cost))
+            joined.update(own)
+        return joined
 
     def name_of(self, name: str, cost: str) -> str:
         """The name of something that each cost has, told apart where there are several."""

@@ -22,6 +22,7 @@ from torchrl_safe.envs.randomization import (
     RANDOMIZATIONS,
     Randomization,
 )
+from torchrl_safe.envs.reflection import Reflection
 from torchrl_safe.envs.robots import ROBOTS, Robot, get_robot
 from torchrl_safe.envs.tasks import GoalTask, NavigationSpeedTask, NavigationTask
 from torchrl_safe.envs.tasks.velocity import VELOCITY_TASKS, VelocityTask, get_velocity_task
@@ -53,6 +54,7 @@ __all__ = [
     "NavigationSpeedTask",
     "NavigationTask",
     "Randomization",
+    "Reflection",
     "Robot",
     "SafeFrameSkip",
     "SafeGoalEnv",

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from torchrl_safe.envs._batched import BatchedEnv
 from torchrl_safe.envs._robot import RobotCore, make_core
 from torchrl_safe.envs.randomization import Randomization
+from torchrl_safe.envs.reflection import Reflection
 from torchrl_safe.envs.robots import Robot
 from torchrl_safe.envs.tasks import Task
 
@@ -101,6 +102,12 @@ class SafeRobotEnv(BatchedEnv):
         )
         super().__init__(core, device)
         self._renderer: Any = None
+
+    @property
+    def reflection(self) -> Reflection | None:
+        """The environment's mirror, or None if task or robot look another way in it."""
+        find = getattr(self._core.task, "reflection", None)
+        return None if find is None else find(self._core.robot)
 
     def layout(self, index: int = 0) -> dict[str, NDArray[np.float64]]:
         """Where things are in one environment, for plots of trajectories.

@@ -66,6 +66,9 @@ class Robot:
         frame_turn (float): angle from the robot's heading to the x axis of its site ``"robot"``,
             the frame of the sensors that a task with bodies adds.
         balls (tuple of str): sites on passive ball joints, whose motion such a task shows, too.
+        mirrored (tuple of tuples of int, optional): what proprioception and action become in a
+            mirror, see :class:`torchrl_safe.envs.Reflection`. None of a robot whose left side is
+            not its right one's mirror image.
 
     Raises:
         ValueError: if a number is out of its range.
@@ -89,6 +92,7 @@ class Robot:
     footprint: tuple[float, float] | None = None
     frame_turn: float = 0.0
     balls: tuple[str, ...] = ()
+    mirrored: tuple[tuple[int, ...], tuple[int, ...]] | None = None
 
     def __post_init__(self) -> None:
         for name in ("timestep", "keepout"):
@@ -245,6 +249,7 @@ _POINT = Robot(
     place=_place_planar,
     control=_control_directly,
     sense=_sense_planar,
+    mirrored=((1, -2, 3, -4, -5), (1, -2)),
 )
 
 _JACKAL = Robot(
@@ -262,6 +267,7 @@ _JACKAL = Robot(
     task="navigation",
     # The wheels reach further than the chassis, in both directions.
     footprint=(0.229, 0.208),
+    mirrored=((1, -2), (1, -2)),
 )
 
 _CAR = Robot(
@@ -280,6 +286,7 @@ _CAR = Robot(
     # Safety-Gymnasium's Car drives along -y.
     frame_turn=np.pi / 2.0,
     balls=("caster",),
+    mirrored=((1, -2, 3, -4, -5), (2, 1)),  # its wheels change places
 )
 
 _DOGGO_TORQUES = Robot(
@@ -302,6 +309,7 @@ _DOGGO = replace(
     proprioception_scale=_CAR.proprioception_scale,
     control=partial(_control_legs, weights=_ASSETS / "doggo_legs.safetensors"),
     sense=_sense_free,
+    mirrored=((1, -2, 3, -4, -5), (1, -2)),
 )
 
 ROBOTS: dict[str, Robot] = {

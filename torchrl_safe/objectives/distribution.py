@@ -15,6 +15,7 @@ from torchrl_safe._checks import check_count, check_number, check_shape
 from torchrl_safe.objectives.functional import check_risk_level
 
 __all__ = [
+    "calibration_scales",
     "cvar_distortion",
     "draw_from_quantiles",
     "project_to_quantiles",
@@ -22,6 +23,7 @@ __all__ = [
     "quantile_levels",
     "quantile_loss",
     "realised_risk",
+    "rescale_quantiles",
     "spectral_risk",
     "spectral_weights",
 ]
@@ -272,15 +274,107 @@ def realised_risk(sums: Tensor, quantiles: Tensor, weights: Tensor) -> Tensor:
     _check_batch("sums", sums, quantiles)
     check_shape("weights", weights, (num_quantiles,), "one per quantile")
     weights = weights.to(quantiles)
-    steps = num_quantiles * weights.diff()
-    # The CVaR's spectrum is one step or two; what does not rise costs nothing.
-    index = steps.nonzero().squeeze(-1)
-    ordered = quantiles.sort(-1).values
-    threshold = (ordered[..., index] + ordered[..., index + 1]) / 2
-    share = 1 - (index + 1).to(weights) / num_quantiles
+    threshold, steps, share = _thresholds(quantiles, weights)
     excess = torch.relu(sums.unsqueeze(-1) - threshold.unsqueeze(-2)).mean(-2)
-    tail = (steps[index] * (share * threshold + excess)).sum(-1)
+    tail = (steps * (share * threshold + excess)).sum(-1)
     return num_quantiles * weights[0] * sums.mean(-1) + tail
+
+
+def rescale_quantiles(
+    quantiles: Tensor, mean_scale: float | Tensor, spread_scale: float | Tensor
+) -> Tensor:
+    r"""Quantiles of a distribution with another mean and spread, of the same shape.
+
+    .. math::
+
+        q'_i = s_m \bar q + s_s (q_i - \bar q)
+
+    Args:
+        quantiles (Tensor): :math:`q`, ``[*B, N]``, in any order.
+        mean_scale (float or Tensor): :math:`s_m`, a scalar.
+        spread_scale (float or Tensor): :math:`s_s`, a scalar.
+
+    Returns:
+        Tensor: ``[*B, N]``, in the same order.
+
+    Examples:
+        >>> import torch
+        >>> rescale_quantiles(torch.tensor([1.0, 3.0]), 2.0, 3.0)
+        tensor([1., 7.])
+    """
+    mean = quantiles.mean(-1, keepdim=True)
+    return mean_scale * mean + spread_scale * (quantiles - mean)
+
+
+def calibration_scales(
+    quantiles: Tensor, sums: Tensor, weights: Tensor, *, low: float = 0.125, high: float = 8.0
+) -> tuple[float, float]:
+    """What quantiles must be rescaled by until they are right on average over states.
+
+    A critic is right about the outcomes that it has learned, and its tail is too light for others:
+    what tells two outcomes apart is easily learned by heart. Outcomes that it has not learned show
+    by how much. With the scales, the mean prediction of the mean is the mean outcome, and that of
+    the risk is the mean :func:`realised_risk`, whose thresholds are rescaled, too: the recalibration
+    of regression (Kuleshov et al. 2018, https://arxiv.org/abs/1807.00263) in the two numbers that
+    a constraint on risk reads.
+
+    Args:
+        quantiles (Tensor): predicted, ``[B, N]``, in any order.
+        sums (Tensor): outcomes that the critic has not learned, ``[B, K]``, equally likely.
+        weights (Tensor): ``[N]``, of the sorted quantiles, see :func:`spectral_weights`.
+
+    Keyword Args:
+        low (float): smallest scale, positive. Defaults to 1 / 8.
+        high (float): largest scale. Defaults to 8.
+
+    Returns:
+        tuple of float: scale of the mean and of the spread, for :func:`rescale_quantiles`. That of
+        the spread is 1 where there is none, or the risk is the mean.
+
+    Raises:
+        ValueError: if shapes disagree, there is no state, or not ``0 < low <= high``.
+
+    Examples:
+        Outcomes 0 or 4, predicted as .5 or 1.5, and the mean of the larger half:
+
+        >>> import torch
+        >>> quantiles, sums = torch.tensor([[0.5, 1.5]]), torch.tensor([[0.0, 4.0]])
+        >>> mean_scale, spread_scale = calibration_scales(quantiles, sums, torch.tensor([0.0, 1.0]))
+        >>> mean_scale, round(spread_scale, 6)
+        (2.0, 4.0)
+    """
+    if not 0 < low <= high:
+        raise ValueError(f"low and high must be 0 < low <= high, got {low} and {high}.")
+    _check_batch("sums", sums, quantiles)
+    check_shape("weights", weights, quantiles.shape[-1:], "one per quantile")
+    if not len(quantiles):
+        raise ValueError("quantiles must be of at least one state, got none.")
+    quantiles, sums, weights = quantiles.double(), sums.double(), weights.double()
+    mean = quantiles.mean(-1)
+    outcome = sums.mean()
+    scale = 1.0
+    if mean.mean() > 0:
+        scale = float((outcome / mean.mean()).clamp(low, high))
+    threshold, steps, share = _thresholds(quantiles, weights)
+    centre = scale * mean
+    excess = spectral_risk(quantiles, weights).mean() - mean.mean()
+    if not excess > 1e-9 * mean.abs().mean():
+        return scale, 1.0
+    constant = quantiles.shape[-1] * weights[0] * outcome
+
+    def too_low(spread: float) -> bool:
+        """Whether the risk predicted with a spread is less than what is realised beyond it."""
+        at = centre.unsqueeze(-1) + spread * (threshold - mean.unsqueeze(-1))
+        beyond = torch.relu(sums.unsqueeze(-1) - at.unsqueeze(-2)).mean(-2)
+        realised = constant + (steps * (share * at + beyond)).sum(-1).mean()
+        return bool(centre.mean() + spread * excess < realised)
+
+    # Thresholds that rise with the spread leave less beyond them: there is one root.
+    below, above = low, high
+    for _ in range(30):
+        middle = (below * above) ** 0.5
+        below, above = (middle, above) if too_low(middle) else (below, middle)
+    return scale, (below * above) ** 0.5
 
 
 def project_to_quantiles(
@@ -362,6 +456,18 @@ def draw_from_quantiles(
     num_quantiles = quantiles.shape[-1]
     index = ((stratum + within) / num_samples * num_quantiles).long()
     return quantiles.sort(-1).values.gather(-1, index.clamp(max=num_quantiles - 1))
+
+
+def _thresholds(quantiles: Tensor, weights: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Where the spectrum rises: values there ``[*B, J]``, by how much, and the share above."""
+    num_quantiles = quantiles.shape[-1]
+    steps = num_quantiles * weights.diff()
+    # The CVaR's spectrum is one step or two; what does not rise costs nothing.
+    index = steps.nonzero().squeeze(-1)
+    ordered = quantiles.sort(-1).values
+    threshold = (ordered[..., index] + ordered[..., index + 1]) / 2
+    share = 1 - (index + 1).to(weights) / num_quantiles
+    return threshold, steps[index], share
 
 
 def _check_batch(name: str, tensor: Tensor, quantiles: Tensor) -> None:

@@ -23,10 +23,12 @@ from torchrl.objectives.value import (
 from torchrl_safe._checks import check_count, check_number, check_shape
 from torchrl_safe.objectives.common import CriticCostLoss, Steps
 from torchrl_safe.objectives.distribution import (
+    calibration_scales,
     cvar_distortion,
     draw_from_quantiles,
     quantile_loss,
     realised_risk,
+    rescale_quantiles,
     spectral_risk,
     spectral_weights,
 )
@@ -37,7 +39,7 @@ from torchrl_safe.objectives.value import (
     distributional_retrace_estimate,
     sampled_lambda_return_estimate,
 )
-from torchrl_safe.objectives.value.utils import get_time_dim, with_action
+from torchrl_safe.objectives.value.utils import get_entry, get_time_dim, with_action
 
 LEVELS = ("mean", "realised")
 
@@ -58,6 +60,10 @@ class QuantileCostLoss(CriticCostLoss):
     ``"retrace"`` corrects for another policy
     (:func:`~torchrl_safe.objectives.value.distributional_retrace_estimate`): for short slices of a
     replay buffer.
+
+    A critic's tail is right for the outcomes that it has learned, and too light for others.
+    :meth:`recalibrate` measures by how much on steps that a network has not learned from, and
+    rescales all that is predicted.
 
     **Units.** The cost is per step. Quantiles, risk and ``cost_limit`` are *discounted sums* of it,
     see :func:`~torchrl_safe.objectives.functional.discounted_cost_limit`.
@@ -143,10 +149,13 @@ class QuantileCostLoss(CriticCostLoss):
             cost_quantiles (NestedKey): Output of the critic. Defaults to ``"cost_quantiles"``.
             target_weight (NestedKey): Weights of the samples under ``cost_target``, used if
                 present. Defaults to ``"target_weight"``.
+            learned_by (NestedKey): Which of the E networks learn from a step, ``[*B, E]`` bool,
+                used if present. Defaults to ``"learned_by"``.
         """
 
         cost_quantiles: NestedKey = "cost_quantiles"
         target_weight: NestedKey = "target_weight"
+        learned_by: NestedKey = "learned_by"
 
     default_keys = _AcceptedKeys
     tensor_keys: _AcceptedKeys
@@ -155,6 +164,7 @@ class QuantileCostLoss(CriticCostLoss):
     cost_network: TensorDictModule
     cost_network_params: TensorDictParams
     target_cost_network_params: TensorDictParams
+    scales: Tensor
 
     def __init__(
         self,
@@ -198,6 +208,7 @@ class QuantileCostLoss(CriticCostLoss):
             deactivate_vmap=deactivate_vmap,
             use_prioritized_weights=use_prioritized_weights,
         )
+        self.register_buffer("scales", torch.ones(2, device=self._default_device))
         self.out_keys = ["loss_cost_quantiles", "cost_value", "cost_std"]
         self.distortion = distortion
         self.level = level
@@ -260,8 +271,10 @@ class QuantileCostLoss(CriticCostLoss):
             samples.expand(len(quantiles), *samples.shape),
             sample_weights.expand(len(quantiles), *samples.shape),
             kappa=self.kappa,
-        ).sum(0)
-        mean, std = _moments(_average(quantiles.detach()))
+        )
+        learned_by = self._learned_by(tensordict, quantiles)
+        loss = (loss if learned_by is None else loss * learned_by).sum(0)
+        mean, std = _moments(self._judged(quantiles.detach()))
         reduction = "none" if self.reduction == "none" else "mean"
         out = {
             "loss_cost_quantiles": self._reduce_loss(loss, tensordict=tensordict, weights=weights),
@@ -316,6 +329,57 @@ class QuantileCostLoss(CriticCostLoss):
             time_dim=self._time_dim(tensordict),
         )
 
+    @torch.no_grad()
+    def recalibrate(self, tensordict: TensorDictBase, *, rate: float = 1.0) -> TensorDict:
+        """Measure how wrong predictions are where networks have not learned, and rescale them.
+
+        The steps must say which networks learn from them, under ``"learned_by"``: those that do
+        not are asked. What follows is in :attr:`scales`, of mean and spread, which is part of
+        ``state_dict`` (:func:`~torchrl_safe.objectives.distribution.calibration_scales`). Targets
+        are not rescaled: they are made where the critic has learned.
+
+        Args:
+            tensordict (TensorDictBase): transitions ``[B]`` with their ``"cost_target"``, equally
+                weighted samples, as of sums of real costs.
+
+        Keyword Args:
+            rate (float): how far the scales move to what was measured, in (0, 1]. Defaults to 1.
+
+        Returns:
+            TensorDict of scalars: ``predicted_mean``, ``realised_mean``, ``predicted_risk`` and
+            ``realised_risk`` of these steps, predictions with the scales as they were before. If
+            all networks learn from all steps, nothing is measured, and it is empty.
+
+        Raises:
+            KeyError: if an entry is missing.
+            ValueError: if an entry has another shape, or ``rate`` is outside (0, 1].
+        """
+        check_number("rate", rate, positive=True, most=1)
+        keys = self.tensor_keys
+        sums = get_entry(tensordict, keys.cost_target, "the sums that followed, [B, K]")
+        get_entry(tensordict, keys.learned_by, "which networks learn from a step, [B, E]")
+        quantiles = self._predict(tensordict, self.cost_network_params).sort(-1).values
+        learned_by = self._learned_by(tensordict, quantiles)
+        assert learned_by is not None
+        asked = ~learned_by.bool()
+        some = asked.any(0)
+        if not some.any():
+            return TensorDict()
+        share = asked / asked.sum(0).clamp(min=1)
+        raw = (quantiles * share.unsqueeze(-1)).sum(0)[some]
+        sums = sums[some].to(raw)
+        weights = self._weights(raw)
+        predicted = rescale_quantiles(raw, *self.scales)
+        report = TensorDict(
+            predicted_mean=predicted.mean(),
+            realised_mean=sums.mean(),
+            predicted_risk=spectral_risk(predicted, weights).mean(),
+            realised_risk=realised_risk(sums, predicted, weights).mean(),
+        )
+        measured = torch.tensor(calibration_scales(raw, sums, weights)).to(self.scales)
+        self.scales.lerp_(measured, rate)
+        return report
+
     def predict(self, tensordict: TensorDictBase, action: Tensor) -> tuple[Tensor, Tensor]:
         """Mean and standard deviation of the predicted distribution.
 
@@ -342,7 +406,7 @@ class QuantileCostLoss(CriticCostLoss):
         Returns:
             The quantiles, in units of the discounted cost sum, ``[*B, N]``.
         """
-        return _average(self._predict_at(tensordict, action))
+        return self._judged(self._predict_at(tensordict, action))
 
     def cvar(self, tensordict: TensorDictBase, action: Tensor) -> Tensor:
         """CVaR of the discounted cost, or the spectral risk in its place, with the pessimism.
@@ -387,7 +451,7 @@ class QuantileCostLoss(CriticCostLoss):
             tensordict, self.tensor_keys.cost, self.value_estimator, next_mean
         )
         quantiles = self._predict(tensordict, self.cost_network_params)
-        excess = self._risk(quantiles) - quantiles.mean((0, -1))
+        excess = self._risk(quantiles) - self._judged(quantiles).mean(-1)
         return mean.to(excess) + self._mean(excess, tensordict)
 
     @torch.no_grad()
@@ -414,7 +478,7 @@ class QuantileCostLoss(CriticCostLoss):
         self._check_single_steps(tensordict, estimator)
         steps = self._read_steps(tensordict, self.tensor_keys.cost, estimator)
         sums = self._sums(tensordict, steps, estimator.gamma, 1.0, None)
-        quantiles = _average(self._predict(tensordict, self.cost_network_params))
+        quantiles = self._judged(self._predict(tensordict, self.cost_network_params))
         risk = realised_risk(sums, quantiles, self._weights(quantiles))
         return self._mean(risk, tensordict)
 
@@ -492,8 +556,21 @@ class QuantileCostLoss(CriticCostLoss):
 
     def _risk(self, quantiles: Tensor) -> Tensor:
         """Risk of the quantiles of every network ``[E, *B, N]``, with the pessimism, ``[*B]``."""
-        risk = spectral_risk(quantiles, self._weights(quantiles))
+        risk = spectral_risk(rescale_quantiles(quantiles, *self.scales), self._weights(quantiles))
         return risk.mean(0) + self.pessimism * _std(risk, 0)
+
+    def _judged(self, quantiles: Tensor) -> Tensor:
+        """What the networks ``[E, *B, N]`` say together, rescaled, ``[*B, N]``."""
+        return rescale_quantiles(_average(quantiles), *self.scales)
+
+    def _learned_by(self, tensordict: TensorDictBase, quantiles: Tensor) -> Tensor | None:
+        """Whether each network learns from a step, as numbers ``[E, *B]``, if the data say so."""
+        key = self.tensor_keys.learned_by
+        learned_by = tensordict.get(key, None)
+        if learned_by is None:
+            return None
+        check_shape(repr(key), learned_by, (*quantiles.shape[1:-1], len(quantiles)), "[*B, E]")
+        return learned_by.movedim(-1, 0).to(quantiles)
 
     def _time_dim(self, tensordict: TensorDictBase) -> int:
         return get_time_dim(tensordict, getattr(self.value_estimator, "time_dim", None))

@@ -6,29 +6,43 @@ too light. Sums of the costs that the newest policies really met hide nothing.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import Any, Literal
 
 import torch
 from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
 from torchrl._utils import timeit
 from torchrl.envs import EnvBase
 
+from torchrl_safe.envs import Reflection
 from torchrl_safe.objectives import QuantileCostLoss
 from torchrl_safe.optim import FiniteSteps
 from torchrl_safe.trainers.options import Group, option, settings_of
 from torchrl_safe.trainers.trainer import ConstrainedTrainer
+
+NUM_FOLDS = 4  # of episodes
+RECALIBRATION_RATE = 0.3  # a window's episodes are few: their noise is averaged over updates
 
 
 class SafetyCritic(Group):
     """What predicts the risk of a cost."""
 
     kind: Literal["gaussian", "quantiles"] = option(
-        "gaussian",
-        "mean and deviation by Retrace, as in the paper; or quantiles of sums of real costs",
+        "quantiles",
+        "quantiles of sums of real costs; or gaussian: mean and deviation by Retrace, as in the "
+        "paper",
         fixed=True,
     )
-    num_quantiles: int = option(32, "of kind=quantiles, as the other two", ge=2, fixed=True)
+    num_quantiles: int = option(32, "of kind=quantiles, as all that follow", ge=2, fixed=True)
+    num_nets: int = option(
+        2,
+        "networks; each leaves out a fourth of the episodes, and is judged by these",
+        ge=1,
+        le=NUM_FOLDS,
+        fixed=True,
+    )
     window: int = option(260, "newest steps of every environment whose costs are summed", ge=2)
     num_updates: int = option(120, "gradient steps per batch of new frames", ge=1)
 
@@ -45,6 +59,7 @@ def make_quantile_losses(trainer: ConstrainedTrainer, env: EnvBase) -> dict[str,
             ),
             risk_level=options.loss.risk_level,
             cost_limit=limit,
+            num_cost_nets=options.safety_critic.num_nets,
             deactivate_vmap=True,
         )
         loss.set_keys(
@@ -59,15 +74,24 @@ def make_quantile_losses(trainer: ConstrainedTrainer, env: EnvBase) -> dict[str,
 class CostSums:
     """The newest steps of every environment, and the critics' learning from their costs.
 
+    Every network leaves out a fourth of the episodes. How wrong it is about them is how wrong it is
+    about layouts that it has not seen, and predictions are rescaled by it.
+
     It is a component of a checkpoint: the steps, and the optimizer's state.
 
     Args:
         trainer (ConstrainedTrainer): whose critics they are.
         losses (mapping of str to QuantileCostLoss): critics of the costs.
+        reflection (Reflection, optional): half of what they learn from is seen in this mirror.
     """
 
-    def __init__(self, trainer: ConstrainedTrainer, losses: Mapping[str, QuantileCostLoss]) -> None:
-        self.trainer, self.losses = trainer, losses
+    def __init__(
+        self,
+        trainer: ConstrainedTrainer,
+        losses: Mapping[str, QuantileCostLoss],
+        reflection: Reflection | None = None,
+    ) -> None:
+        self.trainer, self.losses, self.reflection = trainer, losses, reflection
         self.steps: TensorDictBase | None = None
         params = [p for loss in losses.values() for p in loss.cost_network_params.parameters()]
         self.optim = torch.optim.Adam(params, lr=trainer.options.optim.critic_lr, fused=True)
@@ -113,14 +137,26 @@ class CostSums:
             for loss in self.losses.values():
                 keys = loss.tensor_keys
                 data[keys.cost_target], data[keys.target_weight] = loss.compute_target(steps)
+            fold = steps["collector", "traj_ids"] % NUM_FOLDS
+            network = torch.arange(options.safety_critic.num_nets, device=fold.device)
+            data["learned_by"] = fold.unsqueeze(-1) != network
+            known = known_share(steps["next"], options.loss.cost_gamma)
             data = data.flatten()
         with timeit("time/critics"):
             for _ in range(options.safety_critic.num_updates):
                 size = (options.optim.minibatch_size,)
                 minibatch = data[torch.randint(len(data), size, device=data.device)]
+                if self.reflection is not None:
+                    minibatch = self.reflection.of_half(minibatch)
                 losses = self.trainer.joined(self.losses, minibatch)
                 self._descent.step(losses)
         metrics = {f"update/{name}": value.item() for name, value in losses.items()}
+        # Early, no sum is known to its end: then the half that is known best.
+        enough = known > min(1 - 1 / math.e, 0.5 * known.max().item())
+        for cost, loss in self.losses.items():
+            report = loss.recalibrate(data[enough.flatten()], rate=RECALIBRATION_RATE)
+            for name, value in report.items():
+                metrics[self.trainer.name_of(f"calibration/{name}", cost)] = value.item()
         return metrics | {"update/skipped_cost_steps": float(self._descent.count())}
 
     def rows(self) -> TensorDictBase:
@@ -146,3 +182,23 @@ class CostSums:
         put_back = settings_of(self.optim)
         self.optim.load_state_dict(state["optim"])
         put_back()
+
+
+def known_share(following: TensorDictBase, gamma: float) -> Tensor:
+    """How much of the discounted weight of what follows a step lies within its row.
+
+    Args:
+        following (TensorDictBase): ``done`` and ``terminated`` after the steps, ``[N, T, 1]``; a
+            row ends with its last step.
+        gamma (float): the discount, in [0, 1).
+
+    Returns:
+        Tensor: in (0, 1], ``[N, T]``; 1 where the episode terminates.
+    """
+    done, terminated = following["done"].squeeze(-1), following["terminated"].squeeze(-1)
+    beyond = torch.ones(len(done), device=done.device)  # the share beyond what is known
+    shares = torch.empty(done.shape, device=done.device)
+    for t in reversed(range(done.shape[1])):
+        beyond = gamma * beyond.masked_fill(done[:, t], 1.0).masked_fill(terminated[:, t], 0.0)
+        shares[:, t] = 1.0 - beyond
+    return shares

@@ -23,6 +23,7 @@ from torchrl.envs import EnvBase
 from torchrl.objectives import LossModule
 
 from torchrl_safe import CVaRCostLoss, TsallisLoss
+from torchrl_safe.envs import Reflection
 from torchrl_safe.objectives.value import PolicyEvaluation, evaluate_policy
 from torchrl_safe.optim import FiniteSteps
 from torchrl_safe.trainers.options import Group, option
@@ -40,6 +41,9 @@ class CriticSteps(Group):
     critic_rounds: int = option(16, "times per update that targets are computed", ge=1)
     critic_frames: int = option(15_000, "replayed frames each time", ge=1)
     minibatch_size: int = option(1024, "transitions per gradient step of the critics", ge=1)
+    mirror: bool = option(
+        True, "show half of them in a mirror, where the environment has one (env.reflection)"
+    )
     compile: bool = option(
         False,
         "on a CPU: a minute of compilation, which needs a C++ compiler, then a little faster; for "
@@ -124,6 +128,13 @@ def as_components(trainer: ConstrainedTrainer, name: str, losses: Mapping[str, A
     return {trainer.name_of(name, cost).replace("/", "_"): x for cost, x in losses.items()}
 
 
+def reflection_of(trainer: Trainer, env: EnvBase) -> Reflection | None:
+    """The environment's mirror, if critics are to learn in it and read what it knows."""
+    if not trainer.options.optim.mirror or trainer.in_keys != ["observation"]:
+        return None
+    return getattr(env, "reflection", None)
+
+
 def make_critic_optim(
     trainer: ConstrainedTrainer,
     reward_loss: TsallisLoss,
@@ -187,6 +198,7 @@ class CriticFit:
         reward_loss (TsallisLoss): critics of the reward.
         cost_losses (mapping of str to CVaRCostLoss): critics of the costs.
         optim (torch.optim.Optimizer): of all of them, fused.
+        reflection (Reflection, optional): half of each minibatch is seen in this mirror.
     """
 
     def __init__(
@@ -196,6 +208,7 @@ class CriticFit:
         reward_loss: TsallisLoss,
         cost_losses: Mapping[str, CVaRCostLoss],
         optim: torch.optim.Optimizer,
+        reflection: Reflection | None = None,
     ) -> None:
         self.options = options = trainer.options
         self.keys = replayed(trainer)
@@ -241,6 +254,8 @@ class CriticFit:
 
         def descend(data: TensorDictBase) -> TensorDictBase:
             for minibatch in minibatches(data, options.optim.minibatch_size):
+                if reflection is not None:
+                    minibatch = reflection.of_half(minibatch)
                 losses = losses_of(minibatch)
                 self.steps.step(losses)
             return losses.detach()

@@ -8,12 +8,12 @@ from typing import Any, ClassVar, Literal
 import torch
 from pydantic import Field
 from tensordict import TensorDict, TensorDictBase
-from torch import Tensor
+from torch import Tensor, nn
 from torchrl._utils import timeit
 from torchrl.envs import EnvBase
 
 from torchrl_safe.modules import DISTANCES, Distance
-from torchrl_safe.objectives import CVaRCostLoss, QuantileCostLoss
+from torchrl_safe.objectives import CVaRCostLoss, LimitController, QuantileCostLoss
 from torchrl_safe.optim import FiniteSteps
 from torchrl_safe.trainers.cost_sums import CostSums, SafetyCritic, make_quantile_losses
 from torchrl_safe.trainers.off_policy import (
@@ -25,6 +25,7 @@ from torchrl_safe.trainers.off_policy import (
     make_reward_loss,
     make_slice_buffer,
     minibatches,
+    reflection_of,
     replayed,
 )
 from torchrl_safe.trainers.options import (
@@ -50,15 +51,22 @@ class SafeTACPolicy(Policy):
 class SafeTACLoss(ConstrainedLoss):
     """Reward, entropy and the limit."""
 
-    # An agent held safe from the start freezes.
-    initial_ratio: ClassVar[float] = 3.0
+    # An agent held safer from the start learns to drive later.
+    initial_ratio: ClassVar[float] = 1.5
 
     initial_cost_limit: float | dict[str, float] | None = again(
         ConstrainedLoss,
         "initial_cost_limit",
         None,
-        meaning="moves linearly to cost_limit; null is three times cost_limit: an agent held safe "
-        "from the start freezes",
+        meaning="moves linearly to cost_limit; null is 1.5 times cost_limit: an agent held safer "
+        "from the start learns to drive later",
+    )
+    limit_gain: float = option(
+        0.03,
+        "per update: the limit in use is tightened by this share of what the measured level stands "
+        "above cost_limit, until it no longer does; 0 for none",
+        ge=0,
+        le=1,
     )
     entropic_index: float = option(1.2, "q; 1 is Shannon entropy", gt=0)
     alpha: float = option(0.001, "entropy weight, beta in the paper", gt=0)
@@ -138,11 +146,14 @@ class SafeTAC(ConstrainedTrainer):
         self.reward_loss.make_value_estimator(
             "retrace", gamma=options.loss.gamma, lmbda=options.loss.lmbda
         )
+        reflection = reflection_of(self, env)
         components: dict[str, Any] = {}
         replay_losses: dict[str, CVaRCostLoss] = {}  # of the costs, those that learn from replay
         if options.safety_critic.kind == "quantiles":
             self.cost_losses = make_quantile_losses(self, env)
-            self.cost_sums = components["cost_sums"] = CostSums(self, self.cost_losses)
+            self.cost_sums = components["cost_sums"] = CostSums(
+                self, self.cost_losses, reflection
+            )
         else:
             variance_reward = options.loss.variance_reward
             replay_losses = make_cost_losses(self, env, variance_reward=variance_reward)
@@ -152,7 +163,7 @@ class SafeTAC(ConstrainedTrainer):
         critic_optim = make_critic_optim(self, self.reward_loss, replay_losses)
         self.buffer = make_slice_buffer(self)
         self.fit_critics = CriticFit(
-            self, self.buffer, self.reward_loss, replay_losses, critic_optim
+            self, self.buffer, self.reward_loss, replay_losses, critic_optim, reflection
         )
         components |= {
             "reward_loss": self.reward_loss,
@@ -165,7 +176,13 @@ class SafeTAC(ConstrainedTrainer):
             self.trust_region = make_trust_region(
                 options.optim, self.policy, self.distance, options.device
             )
-            return {**components, "policy_optim": self.trust_region}
+            gain = options.loss.limit_gain
+            self.controllers = nn.ModuleList(LimitController(ki=gain) for _ in self.costs if gain)
+            return {
+                **components,
+                "policy_optim": self.trust_region,
+                "limit_controllers": self.controllers,
+            }
         # (9), the ablation
         adam = torch.optim.Adam(
             self.policy.parameters(), lr=options.lagrangian.policy_lr, fused=True
@@ -194,8 +211,11 @@ class SafeTAC(ConstrainedTrainer):
             return step(batch, metrics)
 
     def _step(self, batch: TensorDictBase, metrics: dict[str, float]) -> dict[str, float]:
-        """The trust region's step, (13)."""
+        """The trust region's step, (13), to limits that make up for where it ends above them."""
         optim, limits = self.options.optim, self.limits()
+        levels = {name: loss.on_policy_cvar(batch) for name, loss in self.cost_losses.items()}
+        for controller, name in zip(self.controllers, limits, strict=False):
+            limits[name] = controller.update(levels[name], limits[name])
         visited = batch.select(*self.in_keys).flatten()
         order = torch.randperm(len(visited), device=visited.device)
         states = visited[order[: optim.policy_frames]]

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchrl_safe.envs._random import RandomStreams
+from torchrl_safe.envs.reflection import Reflection
 from torchrl_safe.envs.robots import Array, Motion, Robot, to_robot_frame
 
 Objects = dict[str, Array]  # what a task remembers of N environments: arrays [N, ...] by name
@@ -82,7 +83,8 @@ class Task(Protocol):
 
     Methods take arrays and leave them alone; the core holds all state. A row of a result depends
     on the same row of the arguments only. A task with several costs names them in ``cost_names``,
-    a tuple of strings.
+    a tuple of strings. One that looks the same in a mirror says so by ``reflection(robot)``, a
+    method that returns a :class:`~torchrl_safe.envs.Reflection`.
     """
 
     @property
@@ -222,6 +224,25 @@ def observe(
     out[:, 3 : 3 + size] = motion.proprioception / proprioception_scale
     out[:, 3 + size :] = (scan - _LIDAR_SHIFT) / _LIDAR_SCALE
     return out
+
+
+def observation_in_mirror(robot: Robot, bins: int) -> Reflection | None:
+    """What becomes of what :func:`observe` shows: the sides of direction and lidar change places.
+
+    Args:
+        robot (Robot): the robot.
+        bins (int): of the lidar, B; they are counted all around, from straight ahead.
+
+    Returns:
+        Reflection: None of a robot that has none.
+    """
+    if robot.mirrored is None:
+        return None
+    proprioception, action = robot.mirrored
+    size = len(proprioception)
+    own = [place + (3 if place > 0 else -3) for place in proprioception]
+    lidar = range(3 + size + bins, 3 + size, -1)
+    return Reflection([1, -2, 3, *own, *lidar], action)
 
 
 def length(vector: Array) -> Array:

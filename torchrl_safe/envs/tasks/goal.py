@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from scipy.special import expit
 
 from torchrl_safe.envs._random import RandomStreams
+from torchrl_safe.envs.reflection import Reflection
 from torchrl_safe.envs.robots import Array, Motion, Robot, to_robot_frame
 from torchrl_safe.envs.tasks.base import (
     Objects,
@@ -23,6 +24,7 @@ from torchrl_safe.envs.tasks.base import (
     check_options,
     length,
     lidar_readings,
+    observation_in_mirror,
     observe,
     offsets,
     pursue_goal,
@@ -97,6 +99,10 @@ class GoalTask:
         hit = np.flatnonzero(scan > 0.0)
         turn = 2.0 * np.pi / self.lidar_bins
         return turn * (hit.astype(np.float64) + 0.5), (1.0 - scan[hit]) * self.lidar_range
+
+    def reflection(self, robot: Robot) -> Reflection | None:
+        """See :func:`torchrl_safe.envs.tasks.base.observation_in_mirror`."""
+        return observation_in_mirror(robot, self.lidar_bins)
 
     def observation_size(self, robot: Robot) -> int:
         """Goal direction (2) and distance (1), proprioception, lidar."""

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from scipy.special import expit
 
 from torchrl_safe.envs._random import RandomStreams
+from torchrl_safe.envs.reflection import Reflection
 from torchrl_safe.envs.robots import Array, Motion, Robot
 from torchrl_safe.envs.tasks.base import (
     Mask,
@@ -25,6 +26,7 @@ from torchrl_safe.envs.tasks.base import (
     Sensed,
     check_options,
     length,
+    observation_in_mirror,
     observe,
     offsets,
     pursue_goal,
@@ -118,6 +120,10 @@ class NavigationTask:
         """The rays that meet something."""
         rays = _lidar(self).rays[scan > 0.0]
         return np.arctan2(rays[:, 1], rays[:, 0]), (1.0 - scan[scan > 0.0]) * self.lidar_range
+
+    def reflection(self, robot: Robot) -> Reflection | None:
+        """See :func:`torchrl_safe.envs.tasks.base.observation_in_mirror`."""
+        return observation_in_mirror(robot, self.lidar_bins)
 
     def observation_size(self, robot: Robot) -> int:
         """Goal direction (2) and distance (1), proprioception, lidar."""

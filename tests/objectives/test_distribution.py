@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from scipy import integrate, optimize, stats
 
 from torchrl_safe.objectives.distribution import (
+    calibration_scales,
     cvar_distortion,
     draw_from_quantiles,
     project_to_quantiles,
@@ -20,6 +21,7 @@ from torchrl_safe.objectives.distribution import (
     quantile_levels,
     quantile_loss,
     realised_risk,
+    rescale_quantiles,
     spectral_risk,
     spectral_weights,
 )
@@ -232,6 +234,89 @@ class TestRealisedRisk:
             realised_risk(rand(2, 1), rand(3, 4), weights)
         with pytest.raises(ValueError, match=r"weights must have shape \(5,\)"):
             realised_risk(rand(3, 1), rand(3, 5), weights)
+
+
+class TestScales:
+    """Recalibration against distributions whose scales are known, and brute force."""
+
+    WEIGHTS = spectral_weights(64, partial(cvar_distortion, risk_level=0.125))
+
+    def true(self):
+        """States of exponential outcomes of different means: quantiles, and one outcome each."""
+        quantiles = 1 + 4 * torch.rand(40_000, 1, generator=torch.Generator().manual_seed(0))
+        cells = -torch.log1p(-quantile_levels(64).double())
+        quantiles = quantiles.double() * cells / cells.mean()
+        rank = torch.randint(64, (40_000, 1), generator=torch.Generator().manual_seed(1))
+        return quantiles, quantiles.gather(1, rank)
+
+    def test_rescaled_is_another_mean_and_spread(self):
+        quantiles = rand(5, 7)
+        scaled = rescale_quantiles(quantiles, 1.5, 0.25)
+        torch.testing.assert_close(scaled.mean(-1), 1.5 * quantiles.mean(-1))
+        torch.testing.assert_close(scaled.std(-1), 0.25 * quantiles.std(-1))
+        assert scaled.argsort(-1).equal(quantiles.argsort(-1))
+
+    @pytest.mark.parametrize(("mean", "spread"), [(1.0, 1.0), (0.8, 0.6), (1.3, 2.0), (1.0, 0.3)])
+    def test_finds_what_a_critic_lacks(self, mean, spread):
+        quantiles, sums = self.true()
+        wrong = rescale_quantiles(quantiles, mean, spread)[:, torch.randperm(64)]
+        found = calibration_scales(wrong, sums, self.WEIGHTS)
+        assert found == pytest.approx((1 / mean, 1 / spread), rel=0.03)
+
+    def test_predicted_is_realised_with_them(self):
+        quantiles, sums = self.true()
+        # Of another shape: no scale makes it right, and the risk is right all the same.
+        wrong = rescale_quantiles(quantiles.sqrt(), 1.0, 2.0)
+        right = rescale_quantiles(wrong, *calibration_scales(wrong, sums, self.WEIGHTS))
+        risk = spectral_risk(right, self.WEIGHTS).mean()
+        realised = realised_risk(sums, right, self.WEIGHTS).mean()
+        torch.testing.assert_close(right.mean(), sums.mean())
+        torch.testing.assert_close(risk, realised, rtol=1e-5, atol=0)
+
+    def test_grid(self):
+        """The spread where predicted and realised cross, of the expected larger one of two."""
+        weights = spectral_weights(8, torch.square)
+        quantiles, sums = rand(50, 8).exp(), rand(50, 3, seed=1).exp()
+        mean, spread = calibration_scales(quantiles, sums, weights)
+        gaps = []
+        grid = np.geomspace(0.125, 8, 4001)
+        for scale in grid:
+            scaled = rescale_quantiles(quantiles, mean, scale)
+            gap = spectral_risk(scaled, weights) - realised_risk(sums, scaled, weights)
+            gaps.append(abs(gap.mean().item()))
+        assert spread == pytest.approx(grid[int(np.argmin(gaps))], rel=2e-3)
+        assert mean == pytest.approx((sums.mean() / quantiles.mean()).item())
+
+    def test_bounds(self):
+        weights = torch.tensor([0.0, 1.0])
+        quantiles = torch.tensor([[1.0, 1.1]])
+        found = calibration_scales(quantiles, torch.tensor([[0.0, 400.0]]), weights, high=3.0)
+        assert found == pytest.approx((3.0, 3.0))
+        found = calibration_scales(quantiles, torch.zeros(1, 2), weights, low=0.5)
+        assert found == pytest.approx((0.5, 0.5))
+
+    def test_nothing_to_scale(self):
+        even, sums = torch.full((3, 4), 2.0), torch.full((3, 1), 3.0)
+        weights = spectral_weights(4, partial(cvar_distortion, risk_level=0.25))
+        assert calibration_scales(even, sums, weights) == (1.5, 1.0)
+        assert calibration_scales(torch.zeros(3, 4), sums, weights) == (1.0, 1.0)
+        everything = spectral_weights(4, lambda u: u)  # the mean: no spread changes it
+        assert calibration_scales(rand(3, 4).exp(), sums, everything)[1] == 1.0
+
+    @pytest.mark.parametrize(
+        ("change", "message"),
+        [
+            ({"sums": torch.zeros(2, 1)}, "sums must have the batch shape"),
+            ({"weights": torch.ones(3)}, "weights must have shape"),
+            ({"low": 0.0}, "0 < low <= high"),
+            ({"low": 2.0, "high": 1.0}, "0 < low <= high"),
+            ({"quantiles": torch.zeros(0, 4), "sums": torch.zeros(0, 1)}, "at least one state"),
+        ],
+    )
+    def test_refuses(self, change, message):
+        given = {"quantiles": torch.ones(3, 4), "sums": torch.ones(3, 1), "weights": torch.ones(4)}
+        with pytest.raises(ValueError, match=message):
+            calibration_scales(**given | change)
 
 
 class TestProjection:

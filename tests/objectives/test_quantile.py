@@ -574,6 +574,84 @@ class TestData:
             make_loss(estimator="retrace")(data)
 
 
+def rand(*shape):
+    return torch.randn(*shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+
+
+class TestRecalibration:
+    """Networks are judged by steps that they have not learned from."""
+
+    def loss(self):
+        critics = [constant_critic([1.0, 3.0]), constant_critic([2.0, 6.0])]
+        return make_loss(critic=critics, num_cost_nets=2, risk_level=0.5)
+
+    def data(self, learned_by, sums):
+        size = len(sums)
+        data = TensorDict(
+            observation=rand(size, OBS), action=rand(size, ACT).tanh(), batch_size=[size]
+        )
+        data["cost_target"] = torch.tensor(sums, dtype=torch.float64).unsqueeze(-1)
+        data["learned_by"] = torch.tensor(learned_by)
+        return data
+
+    def test_those_that_have_not_learned_are_asked(self):
+        loss = self.loss()
+        data = self.data([[False, True]] * 4, [0.0, 8.0, 0.0, 8.0])
+        report = loss.recalibrate(data)
+        assert report["predicted_mean"] == 2.0  # of the first network
+        assert report["predicted_risk"] == 3.0
+        assert report["realised_mean"] == 4.0
+        assert report["realised_risk"] == 8.0  # 2 + (8 - 2) / 2 / .5
+        torch.testing.assert_close(loss.scales, torch.tensor([2.0, 4.0]), rtol=1e-5, atol=0)
+        # What is predicted, by both: mean 3, quantiles 1.5 and 4.5.
+        mean, _ = loss.predict(data, data["action"])
+        close(mean, torch.full((4,), 6.0).double())
+        close(loss.cvar(data, data["action"]), torch.full((4,), 12.0).double(), rtol=1e-5, atol=0)
+        again = loss.recalibrate(data)
+        assert again["predicted_risk"] == pytest.approx(again["realised_risk"].item(), rel=1e-5)
+
+    def test_moves_by_its_rate(self):
+        loss = self.loss()
+        loss.recalibrate(self.data([[False, True]] * 2, [0.0, 8.0]), rate=0.25)
+        torch.testing.assert_close(loss.scales, torch.tensor([1.25, 1.75]), rtol=1e-5, atol=0)
+        other = self.loss()
+        other.load_state_dict(loss.state_dict())
+        assert other.scales.equal(loss.scales)
+
+    def test_nobody_is_asked(self):
+        loss = self.loss()
+        assert loss.recalibrate(self.data([[True, True]] * 2, [0.0, 8.0])).is_empty()
+        assert loss.scales.tolist() == [1.0, 1.0]
+
+    def test_a_network_learns_only_from_its_steps(self):
+        loss = self.loss()
+        data = self.data([[False, True], [True, True]], [100.0, 2.5])
+        loss(data)["loss_cost_quantiles"].backward()
+        (gradient,) = (params.grad for params in loss.cost_network_params.parameters())
+        # (1[z < q] - level) of quantiles at 1/4 and 3/4, mean over quantiles and steps
+        first, second = [-0.25, 0.25], [-0.25 - 0.25, -0.75 + 0.25]
+        close(gradient, torch.tensor([first, second]).double() / 4)
+        data["learned_by"] = torch.tensor([[False, False], [False, False]])
+        assert loss(data)["loss_cost_quantiles"] == 0
+
+    @pytest.mark.parametrize("rate", [0.0, 1.5, math.nan])
+    def test_rate(self, rate):
+        with pytest.raises(ValueError, match="rate must be"):
+            self.loss().recalibrate(self.data([[False, True]], [1.0]), rate=rate)
+
+    def test_entries(self):
+        loss = self.loss()
+        data = self.data([[False, True]], [1.0])
+        with pytest.raises(KeyError, match="learned_by"):
+            loss.recalibrate(data.exclude("learned_by"))
+        with pytest.raises(KeyError, match="cost_target"):
+            loss.recalibrate(data.exclude("cost_target"))
+        data["learned_by"] = torch.ones(1, 3, dtype=torch.bool)
+        with pytest.raises(ValueError, match=r"'learned_by' must have shape \(1, 2\)"):
+            loss.recalibrate(data)
+        assert loss.scales.tolist() == [1.0, 1.0]
+
+
 class TestMisuse:
     @pytest.mark.parametrize(
         ("name", "value"),

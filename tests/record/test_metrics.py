@@ -121,12 +121,15 @@ def noisy_policy(td: TensorDictBase) -> TensorDictBase:
 def brute_force(script: dict[str, torch.Tensor], n: int, num_steps: int, action: float) -> dict:
     total, cost, discounted, cv, entries, goals, length = 0.0, 0.0, 0.0, 0, 0, 0, 0
     terminated = truncated = before = False
+    row = longest = 0
     for t in range(num_steps):
         total += script["reward"][t, n].item() + action
         cost += script["cost"][t, n].item()
         discounted += 0.9**t * script["cost"][t, n].item()
         entries += int(script["violation"][t, n].item() and not before)
         before = script["violation"][t, n].item()
+        row = row + 1 if before else 0
+        longest = max(longest, row)
         cv += int(script["violation"][t, n].item())
         goals += int(script["goal_met"][t, n].item())
         length += 1
@@ -137,6 +140,7 @@ def brute_force(script: dict[str, torch.Tensor], n: int, num_steps: int, action:
         "episode_return": total,
         "violations": cv,
         "entries": entries,
+        "longest_violation": longest,
         "cost": cost,
         "discounted_cost": discounted,
         "terminated": terminated,

@@ -1526,12 +1526,15 @@ KINDS = {
 # One impossible value for each option of each method, and what its message says is allowed.
 IMPOSSIBLE = {
     "seed": (-1, "at least 0"),
+    "loss.limit_gain": (-0.1, "[0, 1]"),
+    "optim.mirror": (2, "one of True, False"),
     "num_threads": (0, "at least 1"),
     "run_dir": ("", "null or a path"),
     "resume": (1, "one of True, False"),
     "update": ("newton", "'trust_region', 'lagrangian', 'pid'"),
     "safety_critic.kind": ("deviation", "'gaussian', 'quantiles'"),
     "safety_critic.num_quantiles": (1, "at least 2"),
+    "safety_critic.num_nets": (5, "at most 4"),
     "safety_critic.window": (1, "at least 2"),
     "safety_critic.num_updates": (0, "at least 1"),
     "env.name": ("", "a name"),

@@ -10,7 +10,7 @@ from tensordict import TensorDict
 
 from torchrl_safe import record
 from torchrl_safe.trainers import SafeTAC
-from torchrl_safe.trainers.cost_sums import CostSums
+from torchrl_safe.trainers.cost_sums import CostSums, known_share, learned_by
 
 QUANTILES = ("safety_critic.kind=quantiles", "safety_critic.num_updates=5")
 N = 64  # environments
@@ -107,6 +107,41 @@ def test_learns_the_distribution(trainer):
     assert mean.item() == pytest.approx(cost.mean().item(), abs=0.25)
     assert risk.item() == pytest.approx(cost.mean().item() / 0.125, abs=0.7)
     assert metrics["update/skipped_cost_steps"] == 0
+
+
+def test_known_share():
+    done = torch.zeros(2, 4, 1, dtype=torch.bool)
+    done[0, 1] = done[1, 2] = True
+    terminated = done.clone()
+    terminated[1] = False
+    known = known_share(TensorDict(done=done, terminated=terminated), 0.5)
+    assert known.tolist() == [[1, 1, 0.75, 0.5], [0.875, 0.75, 0.5, 0.5]]
+
+
+class TestLeftOut:
+    def test_a_fourth_of_the_episodes(self):
+        learned = learned_by(torch.arange(40).reshape(8, 5), 2)
+        assert learned.shape == (8, 5, 2)
+        assert (~learned).sum((0, 1)).tolist() == [10, 10]
+        assert learned.any(-1).all()  # some network learns from every step
+        assert (learned[0, :4, 0] == torch.tensor([False, True, True, True])).all()
+
+    def test_not_where_episodes_are_few(self):
+        assert learned_by(torch.arange(7), 3).all()
+
+    def test_layouts_by_heart_are_found_out(self, trainer):
+        """Costs that nothing tells apart but the episode: what is learned of it fits no other."""
+        generator = torch.Generator().manual_seed(0)
+        for _ in range(40):
+            data = steps(torch.rand(N, 1, generator=generator).expand(N, 6) ** 4, ends=True)
+            data["collector", "traj_ids"] = torch.arange(N)[:, None].expand(N, 6)
+            data["observation"] = torch.randn(N, 1, 24, generator=generator).expand(N, 6, 24)
+            trainer.cost_sums.steps = None
+            trainer.cost_sums.extend(data)
+            metrics = trainer.cost_sums.fit()
+        (loss,) = trainer.cost_losses.values()
+        assert metrics["calibration/predicted_risk"] > 0
+        assert loss.scales[1] > 1.2  # the spread was too small
 
 
 def test_continues_exactly(tmp_path):

@@ -43,12 +43,12 @@ CASES = {
     "safetac_lagrangian": (
         "safetac",
         ["update=lagrangian", *SURROGATE, *REPLAY],
-        {"update/multiplier", "update/loss_cost_std"},
+        {"update/multiplier", "update/loss_cost_quantiles"},
     ),
     "safetac_pid": (
         "safetac",
         ["update=pid", *SURROGATE, *REPLAY],
-        {"update/multiplier", "update/loss_cost_std"},
+        {"update/multiplier", "update/loss_cost_quantiles"},
     ),
 }
 

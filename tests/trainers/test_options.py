@@ -144,10 +144,10 @@ class TestLimit:
     @pytest.mark.parametrize(
         ("named", "frames", "limit"),
         [
-            ({}, 0, 15.0),  # three times
-            ({}, 250_000, 10.0),
+            ({}, 0, 7.5),  # one and a half times
+            ({}, 250_000, 6.25),
             ({}, 500_000, 5.0),
-            ({"cost_limit": 2.0}, 0, 6.0),
+            ({"cost_limit": 2.0}, 0, 3.0),
             ({"cost_limit": 2.0, "anneal_frames": 0}, 400, 2.0),
             ({"initial_cost_limit": 9.0, "anneal_frames": 800}, 400, 7.0),
             ({"cost_limit": {"a": 1.0, "b": 2.0}, "initial_cost_limit": 9.0}, 250_000, 5.0),

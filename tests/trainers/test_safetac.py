@@ -94,7 +94,7 @@ class TestRun:
             "update/cost_level",
             "update/kl",
             "update/case_code",
-            "update/loss_cost_value",
+            "update/loss_cost_quantiles",
             "time/frames_per_second",
             "time/critics",
         ):

@@ -309,7 +309,6 @@ _DOGGO = replace(
     proprioception_scale=_CAR.proprioception_scale,
     control=partial(_control_legs, weights=_ASSETS / "doggo_legs.safetensors"),
     sense=_sense_free,
-    mirrored=((1, -2, 3, -4, -5), (1, -2)),
 )
 
 ROBOTS: dict[str, Robot] = {

@@ -314,9 +314,9 @@ def calibration_scales(
     A critic is right about the outcomes that it has learned, and its tail is too light for others:
     what tells two outcomes apart is easily learned by heart. Outcomes that it has not learned show
     by how much. With the scales, the mean prediction of the mean is the mean outcome, and that of
-    the risk is the mean :func:`realised_risk`, whose thresholds are rescaled, too: the recalibration
-    of regression (Kuleshov et al. 2018, https://arxiv.org/abs/1807.00263) in the two numbers that
-    a constraint on risk reads.
+    the risk is the mean :func:`realised_risk`, whose thresholds are rescaled, too. It is the
+    recalibration of regression (Kuleshov et al. 2018, https://arxiv.org/abs/1807.00263) in the two
+    numbers that a constraint on risk reads.
 
     Args:
         quantiles (Tensor): predicted, ``[B, N]``, in any order.

@@ -175,7 +175,8 @@ def evaluate(
 
     Returns:
         TensorDict: batch size [\*N], per episode. In float64: ``episode_return``, ``violations``
-        (steps), ``entries`` (violating steps after one that was none, or at the start), ``cv_rate``
+        (steps), ``entries`` (violating steps after one that was none, or at the start),
+        ``longest_violation`` (most violating steps in a row), ``cv_rate``
         and ``cost_rate`` (per step), ``cost`` and ``discounted_cost`` (sums), ``score``,
         ``length`` (steps taken); where there are goals, ``goals`` (steps that met one). Of several
         costs, ``<name>_cost``, ``<name>_discounted_cost``, ``<name>_cost_rate``,
@@ -209,6 +210,7 @@ def evaluate(
     total: dict[str, Tensor] = defaultdict(zero.clone)
     running = torch.ones(env.batch_size, dtype=torch.bool, device=env.device)
     violated = torch.zeros_like(running)
+    in_a_row = zero.clone()
     ends = {name: torch.zeros_like(running) for name in ("terminated", "truncated")}
     with acting(exploration_type):
         if seed is not None:
@@ -233,6 +235,8 @@ def evaluate(
             total["violations"] += violations.where(running, 0.0)
             total["entries"] += running & (violations > 0) & ~violated
             violated = violations > 0
+            in_a_row = (in_a_row + 1).where(violated & running, 0.0)
+            total["longest_violation"] = total["longest_violation"].maximum(in_a_row)
             total["length"] += running
             total["duration"] += violations.clamp(min=1.0).where(running, 0.0)
             for name, ended in ends.items():
@@ -268,8 +272,9 @@ def summarize(episodes: TensorDictBase, prefix: str = "eval/") -> dict[str, floa
 
     Returns:
         dict of float: ``return``, the means of all other entries (of ``terminated`` and
-        ``truncated``, the shares), and the 95 % interval ``score_low``, ``score_high`` of the
-        score.
+        ``truncated``, the shares), the 95 % interval ``score_low``, ``score_high`` of the score,
+        and of the violations, if there are any to count, what 95 and 99 % of the episodes do not
+        exceed, ``violations_p95`` and ``violations_p99``: means hide the episodes that matter.
 
     Raises:
         ValueError: if there is no episode.
@@ -288,6 +293,10 @@ def summarize(episodes: TensorDictBase, prefix: str = "eval/") -> dict[str, floa
         for name, value in episodes.items()
     }
     low, high = bootstrap_interval(episodes["score"].flatten())
+    if "violations" in episodes.keys():
+        violations = episodes["violations"].double().flatten()
+        for share in (95, 99):
+            metrics[f"{prefix}violations_p{share}"] = violations.quantile(share / 100).item()
     return {**metrics, f"{prefix}score_low": low, f"{prefix}score_high": high}
 
 

@@ -137,9 +137,9 @@ class CostSums:
             for loss in self.losses.values():
                 keys = loss.tensor_keys
                 data[keys.cost_target], data[keys.target_weight] = loss.compute_target(steps)
-            fold = steps["collector", "traj_ids"] % NUM_FOLDS
-            network = torch.arange(options.safety_critic.num_nets, device=fold.device)
-            data["learned_by"] = fold.unsqueeze(-1) != network
+            data["learned_by"] = learned_by(
+                steps["collector", "traj_ids"], options.safety_critic.num_nets
+            )
             known = known_share(steps["next"], options.loss.cost_gamma)
             data = data.flatten()
         with timeit("time/critics"):
@@ -182,6 +182,22 @@ class CostSums:
         put_back = settings_of(self.optim)
         self.optim.load_state_dict(state["optim"])
         put_back()
+
+
+def learned_by(episode: Tensor, num_nets: int) -> Tensor:
+    """Which networks learn from a step: each but one, or all where there are too few episodes.
+
+    Args:
+        episode (Tensor): the number of the step's episode, ``[*B]``.
+        num_nets (int): networks, E; at most ``NUM_FOLDS``.
+
+    Returns:
+        Tensor: bool, ``[*B, E]``.
+    """
+    network = torch.arange(num_nets, device=episode.device)
+    learned = (episode % NUM_FOLDS).unsqueeze(-1) != network
+    few = episode.unique().numel() < 2 * NUM_FOLDS
+    return torch.ones_like(learned) if few else learned
 
 
 def known_share(following: TensorDictBase, gamma: float) -> Tensor:

@@ -151,9 +151,7 @@ class SafeTAC(ConstrainedTrainer):
         replay_losses: dict[str, CVaRCostLoss] = {}  # of the costs, those that learn from replay
         if options.safety_critic.kind == "quantiles":
             self.cost_losses = make_quantile_losses(self, env)
-            self.cost_sums = components["cost_sums"] = CostSums(
-                self, self.cost_losses, reflection
-            )
+            self.cost_sums = components["cost_sums"] = CostSums(self, self.cost_losses, reflection)
         else:
             variance_reward = options.loss.variance_reward
             replay_losses = make_cost_losses(self, env, variance_reward=variance_reward)
@@ -177,11 +175,11 @@ class SafeTAC(ConstrainedTrainer):
                 options.optim, self.policy, self.distance, options.device
             )
             gain = options.loss.limit_gain
-            self.controllers = nn.ModuleList(LimitController(ki=gain) for _ in self.costs if gain)
+            self.controllers = [LimitController(ki=gain) for _ in self.costs if gain]
             return {
                 **components,
                 "policy_optim": self.trust_region,
-                "limit_controllers": self.controllers,
+                "limit_controllers": nn.ModuleList(self.controllers),
             }
         # (9), the ablation
         adam = torch.optim.Adam(

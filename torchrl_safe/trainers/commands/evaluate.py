@@ -139,6 +139,8 @@ def main(
             bias = bins[f"predicted_{name}"] - bins[f"realised_{name}"]
             metrics[f"calibration{suffix}/{name}_bias"] = bias.mean().item()
             metrics[f"calibration{suffix}/{name}_error"] = bias.abs().mean().item()
+            total = bins[f"predicted_{name}"].mean() / bins[f"realised_{name}"].mean()
+            metrics[f"calibration{suffix}/{name}_predicted_over_realised"] = total.item()
     write_results(out / "results.json", {**metrics, "episodes": episodes_played})
     say(format_table(metrics))
     envs.close()

@@ -217,6 +217,7 @@ class Trainer(ABC):
         final_env.close(raise_if_closed=False)
         if options.video.num_steps:  # of one, as those of others draw all of a batch
             run.film(partial(self.make_env, self._width or 1, seed), self.policy)
+        run.report()
 
     def _loop(
         self, run: Run, collector: BaseCollector, eval_env: EnvBase, stop: GracefulStop

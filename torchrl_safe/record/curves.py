@@ -357,19 +357,22 @@ def _draw_panel(axes: Axes, panel: _Panel, metrics: Curves) -> None:
 
 
 def _draw_comparison(axes: Axes, panel: _Panel, runs: Mapping[str, Sequence[Curves]]) -> None:
-    limits = [line.metric for line in panel.lines if line.style == "--"]
     looks = itertools.cycle(itertools.product(_DASHES, _COLOURS))
     for (label, group), (style, colour) in zip(runs.items(), looks, strict=False):
-        curves = [run[panel.main] for run in group if panel.main in run]
+        # Costs have names of their own in every environment.
+        own = next(each for each in _panels(group[0]) if each.title == panel.title)
+        curves = [run[own.main] for run in group if own.main in run]
         if not curves:
             continue
         steps, values = _aligned(curves)
         if len(curves) > 1:
             low, high = zip(*(bootstrap_interval(torch.tensor(v)) for v in values.T), strict=True)
             _shade(axes, steps, np.array(low), np.array(high), colour)
-        _draw(axes, steps, values.mean(0), _Line(panel.main, label, colour, style))
-        if limits and limits[0] in group[0]:
-            _draw(axes, *group[0][limits[0]], _Line(limits[0], "", colour, "--", 0.8))
+        name = own.lines[0].label.removeprefix("estimate") if own.main.startswith(_LEVEL) else ""
+        _draw(axes, steps, values.mean(0), _Line(own.main, label + name, colour, style))
+        limit = next((line.metric for line in own.lines if line.style == "--"), None)
+        if limit is not None and limit in group[0]:
+            _draw(axes, *group[0][limit], _Line(limit, "", colour, "--", 0.8))
     _finish(axes, panel)
 
 

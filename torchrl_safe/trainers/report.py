@@ -130,8 +130,7 @@ def write_report(folders: Sequence[str | os.PathLike[str]], path: str | os.PathL
     Raises:
         FileNotFoundError: if there is no run.
         CheckpointError: if a configuration is not what was written.
-        FileRefusedError: a ``ValueError``, if there are links where a run has files, or too many
-            runs.
+        FileRefusedError: a ``ValueError``, if there are links in a log, or too many runs.
     """
     looks = [look(folder) for folder in runs_in(folders)]
     path = expand(path)
@@ -175,7 +174,7 @@ def look(folder: Path) -> Look:
 
     Raises:
         CheckpointError: if the configuration is not what was written.
-        FileRefusedError: if a file is a link or too large.
+        FileRefusedError: if there are links in the log.
     """
     import torchrl_safe.trainers.methods  # noqa: F401, makes them known
 
@@ -188,9 +187,15 @@ def look(folder: Path) -> Look:
         meanings={} if known is None else {row.name: row.meaning for row in describe(known)},
         curves=read_metrics(folder / "log") if (folder / "log").is_dir() else {},
         results=_read_results(folder / RESULTS),
-        evaluation=_read_results(folder / "evaluation" / RESULTS),
+        evaluation=_read_results(_evaluation(folder) / RESULTS),
         history=_read_history(folder / HISTORY),
     )
+
+
+def _evaluation(folder: Path) -> Path:
+    """Where an evaluation is; nowhere, if a link stands in its place."""
+    path = folder / "evaluation"
+    return Path(os.devnull) if path.is_symlink() else path
 
 
 def _leaves(
@@ -206,9 +211,10 @@ def _leaves(
 
 
 def _read_results(path: Path) -> Mapping[str, Any]:
+    """Results, or none of a file that is missing or no such file."""
     try:
         results = read_json(path, RESULTS_LIMIT)
-    except OSError:
+    except (OSError, FileRefusedError):
         return {}
     return results if isinstance(results, dict) else {}
 
@@ -289,22 +295,26 @@ def grouped(looks: Sequence[Look]) -> dict[str, list[Look]]:
         rest = {n: v for n, v in each.settings.items() if n not in OF_ONE_RUN}
         groups.setdefault(json.dumps(rest, sort_keys=True, default=str), []).append(each)
     firsts = [group[0] for group in groups.values()]
-    named: dict[str, list[Look]] = {}
-    for first, group in zip(firsts, groups.values(), strict=True):
-        rivals = [other for other in firsts if other.method == first.method]
-        words = [
-            f"{name.rpartition('.')[2]}={_plain(value)}"
-            for name, value in first.settings.items()
-            if name not in OF_ONE_RUN and any(o.settings.get(name) != value for o in rivals)
-        ]
-        places = {other.environment for other in firsts}
-        name = ", ".join([first.method, *([first.environment] if len(places) > 1 else []), *words])
-        if len(words) > 3 or name in named:
-            name = f"{first.method}, {first.path.name}"
-        while name in named:
-            name += "'"
-        named[name] = group
-    return named
+    names = [[first.method for first in firsts]]
+    names.append([f"{first.method}, {first.environment}" for first in firsts])
+    names.append([f"{first.method}, {', '.join(_own_words(first, firsts))}" for first in firsts])
+    names.append([f"{first.method}, {printable(first.path)}" for first in firsts])
+    chosen = [
+        next((form[i] for form in names if form.count(form[i]) == 1), names[-1][i])
+        for i in range(len(firsts))
+    ]
+    return dict(zip(chosen, groups.values(), strict=True))
+
+
+def _own_words(run: Look, others: Sequence[Look]) -> list[str]:
+    """The options in which a run differs from others of its method, three at most."""
+    rivals = [other for other in others if other.method == run.method]
+    words = [
+        f"{name.rpartition('.')[2]}={_plain(value)}"
+        for name, value in run.settings.items()
+        if name not in OF_ONE_RUN and any(each.settings.get(name) != value for each in rivals)
+    ]
+    return words if len(words) <= 3 else [printable(run.path.name)]
 
 
 # The page
@@ -319,8 +329,8 @@ def page(looks: Sequence[Look]) -> str:
         opening = f"<p class='lead'>{verdict(first)}</p>{tiles(first)}"
     else:
         places = sorted({each.environment for each in looks})
-        title = f"{len(looks)} runs, {', '.join(places)}"
-        opening = "<p class='lead'>Mean over the seeds of a setting, with its 95 % interval.</p>"
+        title = f"{len(looks)} runs, {' and '.join(places)}"
+        opening = f"<p class='lead'>{len(groups)} settings side by side.</p>"
     parts = [
         section("What ran", what_ran(groups)),
         section("Learning curves", curves(groups)),
@@ -433,7 +443,8 @@ def facts(group: Sequence[Look]) -> dict[str, str]:
     if not isinstance(last, Mapping):
         return found | {"Software and machine": "not recorded"}
     packages = last.get("packages")
-    found["Commit"] = str(last.get("commit") or "not known: no checkout")
+    commit, _, state = str(last.get("commit") or "not known: no checkout").partition(",")
+    found["Commit"] = (commit[:12] if len(commit) == 40 else commit) + (state and f",{state}")
     found["Software"] = ", ".join(
         [f"Python {last.get('python')}"] + [f"{n} {v}" for n, v in packages.items() if v]
         if isinstance(packages, Mapping)
@@ -531,26 +542,24 @@ def numbers(groups: Mapping[str, Sequence[Look]]) -> str:
         for name, group in groups.items()
         for kind, prefix in source.prefixes.items()
     }
+    firsts = [group[0] for group in groups.values()]
     if len(groups) == 1:
-        content = numbers_table({kind: each for (_, kind), each in values.items()}, everyone)
+        content = numbers_table({kind: each for (_, kind), each in values.items()}, firsts)
     else:
         content = "".join(
             f"<h3>{escape(kind.capitalize())}</h3>"
-            + numbers_table({name: values[name, kind] for name in groups}, everyone)
+            + numbers_table({name: values[name, kind] for name in groups}, firsts)
             for kind in source.prefixes
         )
-    count = len((source.results(everyone[0]).get("episodes") or {}).get("det/", ())) or len(
-        (source.results(everyone[0]).get("episodes") or {}).get("eval/det/", ())
-    )
     over = "episodes" if len(everyone) == len(groups) else "the means of seeds"
     return content + (
-        f"<p class='note'>Per episode, from {count} episodes of {source.words}. "
-        f"Means with 95 % intervals over {over}. {limit_words(everyone[0])}</p>"
+        f"<p class='note'>Per episode, from {source.words}. Means with 95 % intervals over {over}. "
+        f"{limit_words(firsts[0])}</p>"
     )
 
 
 def numbers_table(columns: Mapping[str, Mapping[str, Number]], runs: Sequence[Look]) -> str:
-    """A row per number, a column per setting or way to act."""
+    """A row per number, a column per setting or way to act; ``runs`` are one of each setting."""
     rows = []
     for label, name in ROWS:
         if any(name in values for values in columns.values()):
@@ -558,10 +567,14 @@ def numbers_table(columns: Mapping[str, Mapping[str, Number]], runs: Sequence[Lo
         if name == "return":
             costs = dict.fromkeys(cost for v in columns.values() for cost in costs_among(v))
             for cost in costs:
-                limits = {run.limits.get(cost) for run in runs} - {None}
-                limit = f", limit {limits.pop():g}" if len(limits) == 1 else ""
-                label = escape(_of_cost(cost) + limit)
-                rows.append([label, *(cell(v.get(cost), cost) for v in columns.values())])
+                rows.append(
+                    [escape(_of_cost(cost)), *(cell(v.get(cost), cost) for v in columns.values())]
+                )
+                limits = [run.limits.get(cost, NAN) for run in runs]
+                if len(set(limits)) == 1:
+                    limits = limits[:1] * len(columns)
+                if any(map(math.isfinite, limits)):
+                    rows.append(["Limit on it", *(f"{x:g}" if x == x else "-" for x in limits)])
     return table(list(columns), rows)
 
 
@@ -592,7 +605,7 @@ def media(run: Look) -> str:
     """Film, paths and the safety critic's calibration, as far as there are any."""
     folder, figures = run.path, []
     film = data_uri(folder / "video.mp4", "video/mp4") or data_uri(
-        folder / "evaluation" / "video.mp4", "video/mp4"
+        _evaluation(folder) / "video.mp4", "video/mp4"
     )
     if film:
         figures.append(
@@ -609,7 +622,7 @@ def media(run: Look) -> str:
         f"calibration_{cost}.png": f"Calibration of the safety critic of {cost}." for cost in costs
     }
     for name, caption in pictures.items():
-        source = data_uri(folder / "evaluation" / name, "image/png")
+        source = data_uri(_evaluation(folder) / name, "image/png")
         if source:
             figures.append(
                 f"<figure><img alt='{escape(caption)}' src='{source}'>"
@@ -768,6 +781,7 @@ table { border-collapse: collapse; font-size: 0.925rem; font-variant-numeric: ta
 th, td { text-align: left; vertical-align: top; padding: 0.3rem 1.2rem 0.3rem 0;
   border-bottom: 1px solid var(--rule); overflow-wrap: break-word; min-width: 5.5rem;
   max-width: 34rem; }
+td { overflow-wrap: anywhere; }
 tbody th { font-weight: 500; min-width: 6.5rem; }
 thead th { color: var(--grey); font-weight: 500; }
 mark { background: var(--mark); color: inherit; padding: 0 0.25rem; border-radius: 0.2rem; }

@@ -73,9 +73,11 @@ class Progress:
     Args:
         total (int): frames of the whole run.
         initial (int): frames that it has already. Defaults to 0.
+        unit (str): what is counted. Defaults to frames.
     """
 
-    def __init__(self, total: int, initial: int = 0) -> None:
+    def __init__(self, total: int, initial: int = 0, unit: str = "frames") -> None:
+        self._unit = unit
         self._total, self._initial, self._frames = total, initial, initial
         self._started, self._said = time.perf_counter(), -1
         self._bar: Any = None
@@ -112,7 +114,8 @@ class Progress:
         speed = (self._frames - self._initial) / max(time.perf_counter() - self._started, 1e-9)
         left = tqdm.format_interval(max(self._total - self._frames, 0) / max(speed, 1e-9))
         print(
-            f"{self._frames:,} of {self._total:,} frames, {left} left, {speed:,.0f}/s, {words}",
+            f"{self._frames:,} of {self._total:,} {self._unit}, {left} left, {speed:,.0f}/s, "
+            f"{words}",
             file=Lenient(sys.stderr),
             flush=True,
         )

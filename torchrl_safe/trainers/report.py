@@ -583,7 +583,7 @@ def limit_words(run: Look) -> str:
     if not run.limits:
         return ""
     risk = _number(run.settings.get("loss.risk_level"), 1.0)
-    worst = f", of the worst {risk:.3g} of outcomes" if risk < 1 else ""
+    worst = f" of the worst {risk:.3g} of outcomes" if risk < 1 else ""
     unit = escape(str(run.settings.get("loss.limit_unit")))
     return (
         f"A limit is shown as what it allows an episode at an even cost; it was set in the unit "

@@ -38,7 +38,7 @@ from torchrl_safe.trainers.collectors import ResumableCollector
 from torchrl_safe.trainers.options import Group, again, check_widths, option
 from torchrl_safe.trainers.run import Run
 from torchrl_safe.trainers.streams import stream_seed
-from torchrl_safe.trainers.terminal import GracefulStop, progress_bar, say
+from torchrl_safe.trainers.terminal import GracefulStop, Progress, say
 from torchrl_safe.trainers.trainer import set_up
 
 USED = ["observation", "action", "action_log_prob", "advantage", "value_target"]
@@ -286,9 +286,7 @@ def find_gait(options: Options) -> torch.Tensor:
         seed = stream_seed("gait", options.seed)
         env = make_env(options, population * ways, seed, num_directions=ways)
         std = torch.tensor(stage.std).repeat_interleave(3).expand(6, 6)  # of ahead, of turn
-        progress = progress_bar(
-            total=stage.generations, desc=f"gait, {ways} directions", unit="generation"
-        )
+        progress = Progress(stage.generations, unit=f"generations of a gait, {ways} directions")
         for _ in range(stage.generations):
             candidates = mean + std * torch.randn(population, 6, 6)
             candidates[0] = mean
@@ -299,8 +297,8 @@ def find_gait(options: Options) -> torch.Tensor:
             best = (worth.mean(1) + worth.min(1).values).topk(stage.elites).indices
             mean, std = candidates[best].mean(0), candidates[best].std(0)
             speed = speed.view(population, ways)[best].mean().item()
-            progress.update()
-            progress.set_postfix(speed=f"{speed:.3f}", fallen=f"{fallen.float().mean().item():.3f}")
+            fallen_share = f"{fallen.float().mean().item():.3f}"
+            progress.update(1, speed=f"{speed:.3f}", fallen=fallen_share)
         progress.close()
     return mean
 
@@ -356,7 +354,7 @@ def run_doggo(run: Run) -> None:
         export(legs, run.path / "gait.safetensors")  # to compare with
 
     total = options.collector.total_frames
-    progress = progress_bar(total=total, initial=run.frames, unit="frame")
+    progress = Progress(total, run.frames)
     intervals = (options.eval.interval, options.checkpoint.interval)
     next_eval, next_save = (run.frames // each * each + each for each in intervals)
     eval_env = make_env(
@@ -383,9 +381,10 @@ def run_doggo(run: Run) -> None:
             run.counters["seconds"] += seconds
             metrics["time/frames_per_second"] = batch.numel() / seconds
             run.log(metrics)
-            progress.update(batch.numel())
-            progress.set_postfix(
-                reward=f"{metrics['train/reward']:.3f}", tipped=f"{metrics['train/tipped']:.4f}"
+            progress.update(
+                batch.numel(),
+                reward=f"{metrics['train/reward']:.3f}",
+                tipped=f"{metrics['train/tipped']:.4f}",
             )
             if run.frames >= next_save or stop.requested:
                 next_save += options.checkpoint.interval

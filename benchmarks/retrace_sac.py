@@ -37,7 +37,7 @@ from torchrl_safe.trainers.locks import FolderLock
 from torchrl_safe.trainers.options import Group, again, option
 from torchrl_safe.trainers.saved import CONFIG, write_config
 from torchrl_safe.trainers.streams import stream_seed
-from torchrl_safe.trainers.terminal import progress_bar
+from torchrl_safe.trainers.terminal import Progress
 
 COLUMNS = ("frames", "seconds", "eval_return", "train_return", "alpha", "loss_qvalue", "trace")
 
@@ -212,13 +212,12 @@ def run_retrace_sac(options: Options, run_dir: Path) -> None:
     write_config(run_dir / CONFIG, options)
     updates = round(options.optim.updates_per_frame * options.collector.frames_per_batch)
     frames, started = 0, time.perf_counter()
-    progress = progress_bar(total=options.collector.total_frames, unit="frame")
+    progress, shown = Progress(options.collector.total_frames), {}
     with open(run_dir / "curves.csv", "w", newline="") as file:
         writer = csv.DictWriter(file, COLUMNS)
         writer.writeheader()
         for batch in collector:
             frames += batch.numel()
-            progress.update(batch.numel())
             buffer.extend(batch)
             row = {"frames": frames, "seconds": time.perf_counter() - started}
             ended = batch["next", "done"].squeeze(-1)
@@ -235,7 +234,8 @@ def run_retrace_sac(options: Options, run_dir: Path) -> None:
                 row["trace"] = mean_trace(actor, sample).item()
             if frames % options.eval.interval == 0:
                 row["eval_return"] = evaluate(eval_env, actor, options.eval.num_episodes)
-                progress.set_postfix(eval_return=f"{row['eval_return']:.1f}")
+                shown = {"return": f"{row['eval_return']:.1f}"}
+            progress.update(batch.numel(), **shown)
             writer.writerow({name: f"{value:.6g}" for name, value in row.items()})
             file.flush()
     progress.close()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from pathlib import Path
 
@@ -58,6 +59,57 @@ def _name_what_has_no_page(app: Sphinx, docname: str, source: list[str]) -> None
     source[0] = _LINK.sub(replace, source[0])
 
 
+# Pages that are notebooks, in jupytext's Markdown: text, and cells of Python.
+_FRONT = re.compile(r"^---\n.*?^kernelspec:\n.*?^---\n", re.DOTALL | re.MULTILINE)
+_CELL = re.compile(r"^```python\n(.*?)\n```\n", re.DOTALL | re.MULTILINE)
+
+
+def _offer_notebook(app: Sphinx, docname: str, source: list[str]) -> None:
+    """Below the title of such a page, a link to the file that Jupyter opens."""
+    if _FRONT.match(source[0]):
+        up, name = "../" * docname.count("/"), docname.rpartition("/")[2]
+        link = f'<p><a href="{up}notebooks/{name}.ipynb" download>Download this notebook</a></p>'
+        titled = r"\g<0>\n\n```{raw} html\n" + link + "\n```\n"
+        source[0] = re.sub(r"^# .*$", titled, source[0], count=1, flags=re.MULTILINE)
+
+
+def _write_notebooks(app: Sphinx, error: Exception | None) -> None:
+    """Each page that is a notebook as a file, in the folder ``notebooks`` of the site."""
+    if error is not None or app.builder.format != "html":
+        return
+    for docname in sorted(app.env.found_docs):
+        page = app.env.doc2path(docname)
+        text = Path(page).read_text() if str(page).endswith(".md") else ""
+        if front := _FRONT.match(text):
+            parts = _CELL.split(text[front.end() :])
+            cells = [
+                {
+                    "id": str(i),
+                    "cell_type": kind,
+                    "metadata": {},
+                    "source": part.strip("\n"),
+                    **more,
+                }
+                for i, part in enumerate(parts)
+                for kind, more in [
+                    ("code", {"outputs": [], "execution_count": None})
+                    if i % 2
+                    else ("markdown", {})
+                ]
+                if part.strip()
+            ]
+            kernel = {"display_name": "Python 3", "language": "python", "name": "python3"}
+            notebook = {
+                "cells": cells,
+                "metadata": {"kernelspec": kernel},
+                "nbformat": 4,
+                "nbformat_minor": 5,
+            }
+            folder = Path(app.outdir, "notebooks")
+            folder.mkdir(exist_ok=True)
+            (folder / f"{Path(page).stem}.ipynb").write_text(json.dumps(notebook, indent=1))
+
+
 # To MathML these are identifiers, which stand close to what follows: "lnx".
 _NAMED = re.compile(r"<m[io]>(ln|log|exp|tanh|min|max)</m[io]>")
 
@@ -82,6 +134,8 @@ def _display_math(translator: HTML5Translator, node: nodes.math_block) -> None:
 
 
 def setup(app: Sphinx) -> None:
-    """Register the hook and the formulas."""
+    """Register the hooks and the formulas."""
     app.connect("source-read", _name_what_has_no_page)
+    app.connect("source-read", _offer_notebook)
+    app.connect("build-finished", _write_notebooks)
     app.add_html_math_renderer("mathml", (_inline_math, None), (_display_math, None))

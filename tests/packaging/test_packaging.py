@@ -176,7 +176,9 @@ class TestBuilt:
             "benchmarks/pytest.ini",
             "CHANGELOG.md",
             "CITATION.cff",
+            "CODE_OF_CONDUCT.md",
             "CONTRIBUTING.md",
+            "SECURITY.md",
             "LICENSE",
             "constraints.txt",
         ]:

@@ -1,6 +1,8 @@
 from __future__ import annotations
 
 import math
+import re
+from xml.etree import ElementTree
 
 import imageio.v3 as imageio
 import numpy as np
@@ -9,7 +11,13 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from torchrl.record import CSVLogger
 
-from torchrl_safe.record import format_table, plot_learning_curves, read_metrics
+from torchrl_safe.record import (
+    draw_curves,
+    format_table,
+    plot_learning_curves,
+    read_metrics,
+    terminal_curves,
+)
 
 
 @pytest.fixture
@@ -243,3 +251,95 @@ def test_format_table():
         "zero                 0",
     ]
     assert format_table({}) == ""
+
+
+def line(values, steps=None):
+    return np.arange(len(values)) if steps is None else np.array(steps), np.array(values, float)
+
+
+class TestDrawCurves:
+    def drawn(self, monkeypatch, runs, title):
+        """Lines and bands of a panel, by label."""
+        lines, bands, plot, fill = {}, [], Axes.plot, Axes.fill_between
+
+        def spy(axes, x, y, **style):
+            lines.setdefault(style["label"], []).append((axes, np.array(x), np.array(y)))
+            return plot(axes, x, y, **style)
+
+        def spy_fill(axes, x, low, high, **style):
+            bands.append((axes, np.array(low), np.array(high)))
+            return fill(axes, x, low, high, **style)
+
+        monkeypatch.setattr(Axes, "plot", spy)
+        monkeypatch.setattr(Axes, "fill_between", spy_fill)
+        svg = draw_curves(runs)[title]
+        ElementTree.fromstring(svg.replace("xlink:", ""))
+        of = {label: found[0][1:] for label, found in lines.items()}
+        return of, [band[1:] for band in bands]
+
+    def test_seeds_are_averaged_where_all_have_been(self, monkeypatch):
+        """Seeds that logged at other steps: by hand, on the steps that both reach."""
+        runs = [
+            {"eval/det/return": line([0.0, 4.0, 8.0], [0, 200, 400])},
+            {"eval/det/return": line([3.0, 5.0], [100, 300])},
+        ]
+        lines, ((low, high),) = self.drawn(monkeypatch, {"a": runs}, "Return")
+        steps, mean = lines["a"]
+        assert steps.tolist() == [100, 200, 300]
+        assert mean.tolist() == [2.5, 4.0, 5.5]
+        # Of two seeds, a resample is one, the other or their mean: the ends are the seeds.
+        assert low.tolist() == [2.0, 4.0, 5.0]
+        assert high.tolist() == [3.0, 4.0, 6.0]
+
+    def test_costs_keep_their_names(self, monkeypatch):
+        runs = {
+            "one": [{"update/cost_level": line([1.0, 2.0])}],
+            "two": [{"update/cost_level/speed_cost": line([3.0, 4.0])}],
+        }
+        lines, bands = self.drawn(monkeypatch, runs, "Constraint")
+        assert lines["one"][1].tolist() == [1.0, 2.0]
+        assert lines["two of speed_cost"][1].tolist() == [3.0, 4.0]
+        assert not bands
+
+    def test_colours_are_the_pages(self):
+        (svg, *_) = draw_curves({"a": [{"eval/return": line([1.0, 2.0])}]}).values()
+        assert not re.search("#[0-9a-f]{6}", svg.replace("xlink", ""), re.IGNORECASE)
+        assert "<text" in svg
+
+    def test_none(self):
+        with pytest.raises(ValueError, match="runs must hold at least one, got"):
+            draw_curves({"a": []})
+
+
+class TestTerminalCurves:
+    def test_a_rising_line_rises(self):
+        """Each character's dots, seen as a picture: one path from below left to above right."""
+        _, *rows = terminal_curves({"eval/return": line([0.0, 1.0])}, width=29, height=5).split(
+            "\n"
+        )
+        dots = np.zeros((20, 40), bool)
+        places = [(0, 0), (1, 0), (2, 0), (0, 1), (1, 1), (2, 1), (3, 0), (3, 1)]  # Unicode's
+        for i, row in enumerate(rows):
+            for j, character in enumerate(row[9:]):
+                for bit, (down, right) in enumerate(places):
+                    dots[4 * i + down, 2 * j + right] = (ord(character) - 0x2800) >> bit & 1
+        heights = 19 - np.array([column.nonzero()[0].mean() for column in dots.T])
+        np.testing.assert_allclose(heights, np.linspace(0, 19, 40), atol=0.8)
+
+    def test_limit_has_the_same_scale(self):
+        level, limit = line([1.0, 1.0]), line([3.0, 3.0])
+        text = terminal_curves({"update/cost_level": level, "update/cost_limit": limit}, width=30)
+        title, top, *_, bottom = text.split("\n")
+        assert title == "Constraint"
+        assert top.startswith("       3 \u2809")
+        assert bottom.startswith("       1 \u28c0")
+
+    @pytest.mark.parametrize("width", [1, 9, 69, 70, 200])
+    def test_fits(self, run, width):
+        log_full_run(run)
+        text = terminal_curves(read_metrics(run_dir(run)), width)
+        assert max(map(len, text.split("\n"))) <= max(width, 10)
+
+    @pytest.mark.parametrize("values", [[math.nan], [math.inf, 1.0], [2.0], []])
+    def test_numbers_that_are_none(self, values):
+        assert isinstance(terminal_curves({"eval/return": line(values)} if values else {}), str)

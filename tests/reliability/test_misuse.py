@@ -1461,6 +1461,7 @@ for function in (record.read_metrics, partial(record.plot_learning_curves, path=
         "'nowhere'",
         "a directory",
     )
+bad("draw_curves: none", lambda: record.draw_curves({}), ValueError, "runs", "{}", "at least one")
 record_paths = partial(record.record_trajectories, env(), act, num_episodes=2)
 each("record_trajectories", record_paths, "num_steps", (0,), "at least 1", state=snapshot)
 each("record_trajectories", record_paths, "num_episodes", (0, 4), "in [1, 3]", state=snapshot)

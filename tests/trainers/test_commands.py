@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import shutil
 import subprocess
@@ -131,6 +132,17 @@ def test_watch(run_dir, capsys):
     assert (run_dir / "curves.png").stat().st_size > 5_000
     assert "800 of 800" in out
     assert "update/kl" in out
+    assert "Constraint" in out
+    assert any("\u2800" <= character <= "\u28ff" for character in out)
+
+
+def test_watch_on_a_terminal_of_few_characters(run_dir, monkeypatch, capsys):
+    """What it cannot show is left out: the rest is said all the same."""
+    stream = io.TextIOWrapper(io.BytesIO(), encoding="latin-1")
+    monkeypatch.setattr("sys.stdout", stream)
+    watch.main(run_dir, every=1.0, once=True)
+    stream.seek(0)
+    assert "update/kl" in stream.read()
 
 
 def test_watch_without_a_log(tmp_path):

@@ -318,7 +318,7 @@ def test_resumed(trained, monkeypatch, capsys):
     assert "from frame 100 on, optim.max_kl is 0.5; it was 0.02" in capsys.readouterr().out
     settings = saved.read_config(trained / "config.yaml")
     assert (settings["loss"]["cost_limit"], settings["optim"]["max_kl"]) == (2.5, 0.5)
-    history = [json.loads(line) for line in (trained / runs.HISTORY).read_text().splitlines()]
+    history = [json.loads(line) for line in (trained / saved.HISTORY).read_text().splitlines()]
     assert [entry["frames"] for entry in history] == [0, 100]
     assert history[0]["changed"] == {}
     assert history[1]["changed"]["loss.gamma"] == {"from": 0.99, "to": 0.9}

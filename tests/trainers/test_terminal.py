@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -16,10 +17,11 @@ from torchrl_safe.trainers.terminal import GracefulStop, Lenient, say
 
 TALK = """
 import sys, terminal
-progress = terminal.progress_bar(total=3000, mininterval=0)
+if "bar" in sys.argv and sys.stderr:
+    sys.stderr.isatty = lambda: True
+progress = terminal.Progress(total=3000)
 for i in range(3000):
-    progress.update()
-    progress.set_postfix(reward="1.0")
+    progress.update(1, cost="31.2/25")
     terminal.say("a line " * 20)
 progress.close()
 open(sys.argv[1], "w").write("went on")
@@ -29,10 +31,13 @@ open(sys.argv[1], "w").write("went on")
 @pytest.mark.parametrize(
     "rest", ["2>&1 | head -c 100", "2>&1 >/dev/null | head -c 100", "2>&-", ">&-", ">&- 2>&- <&-"]
 )
-def test_nobody_reads(tmp_path, rest):
+@pytest.mark.parametrize("kind", ["bar", "lines"])
+def test_nobody_reads(tmp_path, rest, kind):
     """The reader of a pipe leaves, or there is no stream at all; the exit status stays 0."""
     (tmp_path / "talk.py").write_text(TALK)
-    command = f"set -o pipefail; '{sys.executable}' talk.py went {rest}; exit ${{PIPESTATUS[0]}}"
+    command = (
+        f"set -o pipefail; '{sys.executable}' talk.py went {kind} {rest}; exit ${{PIPESTATUS[0]}}"
+    )
     result = subprocess.run(
         ["bash", "-c", command],
         cwd=tmp_path,
@@ -55,6 +60,61 @@ def test_hung_up_terminal(tmp_path):
     stream = Lenient(HungUp())
     assert stream.write("text") == 4
     stream.flush()
+
+
+class TestProgress:
+    def play(self, total=2_000, each=10, initial=0):
+        progress = terminal.Progress(total, initial)
+        for _ in range((total - initial) // each):
+            progress.update(each, cost="31.2/25", violations="4.0")
+        progress.close()
+
+    def test_a_log_gets_a_line_for_every_twentieth(self, capsys):
+        self.play()
+        first, *_, last = lines = capsys.readouterr().err.splitlines()
+        assert len(lines) == 21  # the first update says that it goes
+        assert first.startswith("10 of 2,000 frames, ")
+        assert last.startswith("2,000 of 2,000 frames, 00:00 left, ")
+        assert all(line.endswith("/s, cost 31.2/25, violations 4.0") for line in lines)
+        assert not any("\r" in line for line in lines)
+
+    def test_a_resumed_run_goes_on(self, capsys):
+        self.play(initial=1_000)
+        lines = capsys.readouterr().err.splitlines()
+        assert len(lines) == 11
+        assert lines[0].startswith("1,010 of 2,000")
+
+    def test_more_frames_than_asked_for(self, capsys):
+        """The last batch is whole."""
+        progress = terminal.Progress(100)
+        progress.update(160)
+        assert capsys.readouterr().err.startswith("160 of 100 frames, 00:00 left")
+
+    def test_a_terminal_has_a_bar(self, monkeypatch):
+        class Terminal(io.StringIO):
+            def isatty(self):
+                return True
+
+        stream = Terminal()
+        monkeypatch.setattr("sys.stderr", stream)
+        self.play()
+        last = stream.getvalue().rpartition("\r")[2]
+        assert re.search(r"100 %\|.*\| 2.00k/2.00k, 00:00 left, .*/s, cost 31.2/25, viol", last)
+
+    def test_a_notebook_has_its_widget(self, monkeypatch):
+        made = []
+
+        class Widget(terminal.tqdm):
+            def __init__(self, **options):
+                made.append(self)
+                super().__init__(**options, file=io.StringIO())
+
+        monkeypatch.setattr(terminal.auto, "notebook_tqdm", Widget)
+        monkeypatch.setattr(terminal.auto, "tqdm", Widget)
+        self.play()
+        (bar,) = made
+        assert bar.n == bar.total == 2_000
+        assert bar.postfix == "cost 31.2/25, violations 4.0"
 
 
 def test_is_said(capsys):

@@ -6,7 +6,13 @@ where ``goal_met`` is written, and paths drawn where an environment has a ``layo
 """
 
 from torchrl_safe.record.calibration import calibrate, discounted_sums, plot_calibration
-from torchrl_safe.record.curves import format_table, plot_learning_curves, read_metrics
+from torchrl_safe.record.curves import (
+    draw_curves,
+    format_table,
+    plot_learning_curves,
+    read_metrics,
+    terminal_curves,
+)
 from torchrl_safe.record.metrics import (
     batch_metrics,
     bootstrap_interval,
@@ -32,6 +38,7 @@ __all__ = [
     "count_violations",
     "describe",
     "discounted_sums",
+    "draw_curves",
     "evaluate",
     "format_table",
     "plot_calibration",
@@ -43,4 +50,5 @@ __all__ = [
     "record_video",
     "score",
     "summarize",
+    "terminal_curves",
 ]

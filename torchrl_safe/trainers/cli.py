@@ -4,6 +4,7 @@
     torchrl-safe train cpo env=gym env.id=Pendulum-v1 env.cost=my_costs:speed
     torchrl-safe train trc --multirun seed=0,1,2
     torchrl-safe evaluate runs/safetac/point/seed_0
+    torchrl-safe report runs/safetac/point/seed_0
     torchrl-safe play safetac-point
 
 Options of training are hydra's grammar; the other commands have ``--help``.
@@ -27,7 +28,7 @@ from hydra.errors import CompactHydraException
 from omegaconf import DictConfig, OmegaConf
 from torchrl.checkpoint import CheckpointError
 
-from torchrl_safe.trainers.commands import evaluate, export, play, watch
+from torchrl_safe.trainers.commands import evaluate, export, play, report, watch
 from torchrl_safe.trainers.methods import METHODS
 from torchrl_safe.trainers.options import Options, flat
 
@@ -45,7 +46,7 @@ HYDRA = {
 
 
 COMMANDS: dict[str, Any] = {
-    module.__name__.rpartition(".")[2]: module for module in (evaluate, watch, export, play)
+    module.__name__.rpartition(".")[2]: module for module in (evaluate, watch, report, export, play)
 }
 
 

@@ -549,6 +549,27 @@ class Description(NamedTuple):
     fixed: bool
 
 
+def per_episode(limit: float, unit: str, cost_gamma: float, num_steps: int) -> float:
+    """What a limit amounts to as the sum of an episode's costs, at the same cost in every step.
+
+    Args:
+        limit (float): in ``unit``.
+        unit (str): of ``loss.limit_unit``.
+        cost_gamma (float): discount of the cost, in [0, 1).
+        num_steps (int): of the episode.
+
+    Examples:
+        >>> per_episode(5.0, "discounted", 0.99, 1_000)  # 0.05 in each of 1,000 steps
+        50.0
+        >>> per_episode(0.05, "step", 0.99, 1_000), per_episode(25.0, "episode", 0.99, 1_000)
+        (50.0, 25.0)
+    """
+    if unit == "episode":
+        return limit
+    rate = limit * (1 - cost_gamma) if unit == "discounted" else limit
+    return round(rate * num_steps, 9)  # 1 - 0.99 is not quite 0.01
+
+
 def describe(group: type[Group], prefix: str = "") -> list[Description]:
     """Every option of a class, in the order of their declaration."""
     rows = []

@@ -43,12 +43,20 @@ from torchrl_safe.trainers.collectors import envs_per_batch
 from torchrl_safe.trainers.locks import FolderLock
 from torchrl_safe.trainers.logs import Log
 from torchrl_safe.trainers.options import MethodOptions, settings_of, settle
-from torchrl_safe.trainers.saved import CONFIG, Configuration, read_config, write_config
+from torchrl_safe.trainers.report import write_report
+from torchrl_safe.trainers.saved import (
+    CONFIG,
+    HISTORY,
+    RESULTS,
+    RESULTS_LIMIT,
+    Configuration,
+    read_config,
+    write_config,
+)
 from torchrl_safe.trainers.streams import stream_seed
+from torchrl_safe.trainers.surroundings import surroundings
 from torchrl_safe.trainers.terminal import say
 
-HISTORY = "history.jsonl"
-RESULTS_LIMIT = 2**28  # bytes
 KINDS = {"eval/": ExplorationType.RANDOM, "eval/det/": ExplorationType.DETERMINISTIC}
 
 
@@ -221,7 +229,7 @@ class Run:
         if self.frames_left or any(n.startswith(("eval.", "video.")) for n in self.changed):
             return False
         try:
-            return read_json(self.path / "results.json", RESULTS_LIMIT)["frames"] == self.frames
+            return read_json(self.path / RESULTS, RESULTS_LIMIT)["frames"] == self.frames
         except (OSError, ValueError, TypeError, KeyError):
             return False  # none, or not a whole one: they are written again
 
@@ -256,6 +264,7 @@ class Run:
             "process": os.getpid(),
             "machine": platform.node(),
             "changed": {n: {"from": old, "to": new} for n, (old, new) in self.changed.items()},
+            "surroundings": surroundings(),
         }
         path = self.path / HISTORY
         history = read_bytes(path, JSON_LIMIT).decode() if os.path.lexists(path) else ""
@@ -331,7 +340,7 @@ class Run:
             "frames_per_second": frames / seconds if seconds else 0.0,
             "episodes": {prefix: describe(each) for prefix, each in played.items()},
         }
-        write_results(self.path / "results.json", results)
+        write_results(self.path / RESULTS, results)
         self.plot()
         rows = {
             f"score, deterministic ({env.batch_size.numel()} episodes)": metrics["eval/det/score"],
@@ -365,6 +374,13 @@ class Run:
             say(f"video: {path}")
         except Exception as error:  # whatever it is, the results are written
             say(f"no video: {error}")
+
+    def report(self) -> None:
+        """The page about the run, see :func:`~torchrl_safe.trainers.report.write_report`."""
+        try:
+            say(f"report: {write_report([self.path], self.path / 'report.html')}")
+        except Exception as error:  # whatever it is, the results are written
+            say(f"no report: {type(error).__name__}: {error}")
 
 
 def cost_gamma(options: Any) -> float:

@@ -24,6 +24,9 @@ from torchrl_safe.trainers.checkpoints import latest, load_components
 from torchrl_safe.trainers.options import Options, flat
 
 CONFIG = "config.yaml"
+HISTORY = "history.jsonl"
+RESULTS = "results.json"
+RESULTS_LIMIT = 2**28  # bytes
 CONFIG_LIMIT = 2**14  # bytes; brackets in brackets take the parser a while for each
 SEAL = b"# SHA-256 of the lines above: "
 

@@ -6,11 +6,14 @@ import os
 import signal
 import sys
 import threading
+import time
 from contextlib import suppress
 from types import FrameType
 from typing import Any, TextIO
 
-from tqdm import tqdm
+from tqdm import auto, tqdm
+
+LINES = 20  # that a log gets of a whole run
 
 
 class Lenient:
@@ -49,14 +52,78 @@ class Lenient:
             self._stream = None
 
 
+def is_terminal(stream: Any) -> bool:
+    """Whether what is written is seen at once; not of a closed stream or none."""
+    try:
+        return bool(stream.isatty())
+    except (AttributeError, ValueError):
+        return False
+
+
 def say(text: str) -> None:
     """A line on the terminal, if there is one."""
     print(text, file=Lenient(sys.stdout), flush=True)
 
 
-def progress_bar(**options: Any) -> tqdm:
-    """A progress bar that ends nothing when it cannot be drawn."""
-    return tqdm(file=Lenient(sys.stderr), **options)
+class Progress:
+    """How far a run is, on stderr; it ends nothing when it cannot be shown.
+
+    A terminal and a notebook have a bar that moves. A file or a pipe gets a line every 5 %.
+
+    Args:
+        total (int): frames of the whole run.
+        initial (int): frames that it has already. Defaults to 0.
+        unit (str): what is counted. Defaults to frames.
+    """
+
+    def __init__(self, total: int, initial: int = 0, unit: str = "frames") -> None:
+        self._unit = unit
+        self._total, self._initial, self._frames = total, initial, initial
+        self._started, self._said = time.perf_counter(), -1
+        self._bar: Any = None
+        if auto.notebook_tqdm is not tqdm:  # a notebook that has widgets
+            self._bar = auto.tqdm(total=total, initial=initial, unit="", unit_scale=True)
+        elif is_terminal(sys.stderr):
+            self._bar = tqdm(
+                total=total,
+                initial=initial,
+                file=Lenient(sys.stderr),
+                unit="",
+                unit_scale=True,
+                dynamic_ncols=True,
+                bar_format="{percentage:3.0f} %|{bar}| {n_fmt}/{total_fmt}, {remaining} left, "
+                "{rate_fmt}{postfix}",
+            )
+
+    def update(self, frames: int, **numbers: str) -> None:
+        """Go on by some frames.
+
+        Args:
+            frames (int): how many.
+            **numbers: what is shown beside, by name.
+        """
+        self._frames += frames
+        words = ", ".join(f"{name} {text}" for name, text in numbers.items())
+        if self._bar is not None:
+            self._bar.set_postfix_str(words, refresh=False)
+            self._bar.update(frames)
+            return
+        if self._frames < self._total and self._frames * LINES // self._total <= self._said:
+            return
+        self._said = self._frames * LINES // self._total
+        speed = (self._frames - self._initial) / max(time.perf_counter() - self._started, 1e-9)
+        left = tqdm.format_interval(max(self._total - self._frames, 0) / max(speed, 1e-9))
+        print(
+            f"{self._frames:,} of {self._total:,} {self._unit}, {left} left, {speed:,.0f}/s, "
+            f"{words}",
+            file=Lenient(sys.stderr),
+            flush=True,
+        )
+
+    def close(self) -> None:
+        """Leave the line as it is."""
+        if self._bar is not None:
+            self._bar.close()
 
 
 class GracefulStop:

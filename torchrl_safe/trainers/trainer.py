@@ -27,10 +27,10 @@ from torchrl_safe.record import batch_metrics, count_violations
 from torchrl_safe.trainers.collectors import WorkerDied, make_collector
 from torchrl_safe.trainers.environments import cost_names, has_state, make_env, source_of
 from torchrl_safe.trainers.networks import MakeNetwork, is_discrete, make_critic, make_policy
-from torchrl_safe.trainers.options import ConstrainedLoss, MethodOptions, flat
+from torchrl_safe.trainers.options import ConstrainedLoss, MethodOptions, flat, per_episode
 from torchrl_safe.trainers.run import Run
 from torchrl_safe.trainers.streams import stream_seed
-from torchrl_safe.trainers.terminal import GracefulStop, progress_bar, say
+from torchrl_safe.trainers.terminal import GracefulStop, Progress, say
 
 WIDTHS = ("env.num_envs", "eval.num_episodes", "eval.final_episodes")  # of batches
 
@@ -217,15 +217,14 @@ class Trainer(ABC):
         final_env.close(raise_if_closed=False)
         if options.video.num_steps:  # of one, as those of others draw all of a batch
             run.film(partial(self.make_env, self._width or 1, seed), self.policy)
+        run.report()
 
     def _loop(
         self, run: Run, collector: BaseCollector, eval_env: EnvBase, stop: GracefulStop
     ) -> None:
         options = self.options
         collector.update_policy_weights_()  # workers start with what a checkpoint brought
-        progress = progress_bar(
-            total=options.collector.total_frames, initial=run.frames, unit="frame"
-        )
+        progress = Progress(options.collector.total_frames, run.frames)
         next_eval, next_save = (
             run.frames // interval * interval + interval
             for interval in (options.eval.interval, options.checkpoint.interval)
@@ -248,13 +247,7 @@ class Trainer(ABC):
             metrics["time/frames_per_second"] = batch.numel() / seconds
             timeit.erase()
             run.log(metrics)
-            progress.update(batch.numel())
-            progress.set_postfix(
-                reward=f"{metrics['train/reward_per_1000']:.1f}",
-                cost=" ".join(f"{x:.3f}" for n, x in metrics.items() if is_cost_rate(n)),
-                cv=f"{metrics['train/cv_rate']:.4f}",
-                kl=f"{metrics.get('update/kl', 0.0):.4f}",
-            )
+            progress.update(batch.numel(), **self.standing(metrics))
             if run.frames >= next_save:
                 next_save += options.checkpoint.interval
                 run.save()
@@ -263,6 +256,24 @@ class Trainer(ABC):
             # After the log: where a worker has died meanwhile, the update is saved and logged.
             collector.update_policy_weights_()
         progress.close()
+
+    def standing(self, metrics: Mapping[str, float]) -> dict[str, str]:
+        """Return, costs beside their limits and violations, for the progress line.
+
+        All are of the newest batch, per episode of ``eval.num_steps`` steps.
+        """
+        steps, limits = self.options.eval.num_steps, self.episode_limits()
+        words = {"return": f"{metrics['train/reward_per_1000'] * steps / 1_000:.1f}"}
+        for name, rate in metrics.items():
+            if is_cost_rate(name):
+                cost = name.removeprefix("train/").removesuffix("_rate")
+                limit = f"/{limits[cost]:.3g}" if cost in limits else ""
+                words[cost] = f"{rate * steps:.1f}{limit}"
+        return words | {"violations": f"{metrics['train/cv_rate'] * steps:.1f}"}
+
+    def episode_limits(self) -> dict[str, float]:
+        """The limits of now on the costs of an episode of ``eval.num_steps``; none by default."""
+        return {}
 
     def _count(self, run: Run, batch: TensorDictBase) -> dict[str, float]:
         """What a batch adds to the counters, and is by itself."""
@@ -294,6 +305,14 @@ class ConstrainedTrainer(Trainer):
         """The limits of now on the discounted sums, by cost."""
         loss, scale = self.options.loss, discounted_unit(self.options)
         return {name: scale * limit_at(loss, name, self.frames) for name in self.costs}
+
+    def episode_limits(self) -> dict[str, float]:
+        """The limits of now as sums of an episode of ``eval.num_steps``, by cost."""
+        gamma, steps = self.options.loss.cost_gamma, self.options.eval.num_steps
+        return {
+            name: per_episode(limit, "discounted", gamma, steps)
+            for name, limit in self.limits().items()
+        }
 
     def levels(self, levels: Mapping[str, float | Tensor]) -> dict[str, float]:
         """Metrics of how high costs stand, and of the limits of now, in ``loss.limit_unit``.

@@ -1,22 +1,30 @@
-"""A run seen from another terminal: draws its curves again and again, and prints where it stands.
+"""A run seen from another terminal: its curves, there and as a picture, and where it stands.
 
     torchrl-safe watch runs/safetac_point/seed_0            # until Ctrl-C
     torchrl-safe watch runs/safetac_point/seed_0 --once
 
-The picture is ``curves.png`` in the run's folder; most viewers and editors follow the file. It
-reads the csv log; other backends have viewers of their own (``tensorboard --logdir``, ``wandb
-sync``).
+Curves are drawn below the newest metrics, and as ``curves.png`` in the run's folder; most viewers
+and editors follow the file. It reads the csv log; other backends have viewers of their own
+(``tensorboard --logdir``, ``wandb sync``).
 """
 
 from __future__ import annotations
 
 import argparse
 import contextlib
+import shutil
+import sys
 import time
 from pathlib import Path
+from typing import Any
 
 from torchrl_safe._files import check_folder, expand, printable
-from torchrl_safe.record import format_table, plot_learning_curves, read_metrics
+from torchrl_safe.record import (
+    format_table,
+    plot_learning_curves,
+    read_metrics,
+    terminal_curves,
+)
 from torchrl_safe.trainers.saved import CONFIG, read_config
 from torchrl_safe.trainers.terminal import say
 
@@ -59,7 +67,7 @@ def main(run_dir: Path, every: float = 30.0, once: bool = False) -> None:
 
 
 def look(run_dir: Path) -> str:
-    """Draw the curves, and say what the log says last."""
+    """Draw the curves, and say what the log says last, with curves as wide as the terminal."""
     run_dir = expand(run_dir)
     settings = read_config(run_dir / CONFIG)
     log = run_dir / "log"
@@ -76,4 +84,15 @@ def look(run_dir: Path) -> str:
         left = max(total - frames, 0) / speeds[-1]
         rows["time left"] = f"{left // 3600:.0f} h {left % 3600 // 60:.0f} min"
     metrics = {name: float(values[-1]) for name, (_, values) in curves.items()}
-    return format_table(rows | metrics | rows)  # no metric passes for them
+    table = format_table(rows | metrics | rows)  # no metric passes for them
+    width = min(shutil.get_terminal_size().columns, 120)
+    return f"{table}\n\n{terminal_curves(curves, width)}" if shows_dots(sys.stdout) else table
+
+
+def shows_dots(stream: Any) -> bool:
+    """Whether a stream's encoding has the characters that curves are drawn with."""
+    try:
+        "\u28ff".encode(getattr(stream, "encoding", None) or "ascii")
+    except UnicodeEncodeError:
+        return False
+    return True

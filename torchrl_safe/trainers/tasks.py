@@ -4,7 +4,13 @@ from __future__ import annotations
 
 from typing import Any
 
-from torchrl_safe.envs.tasks import SAFETY_TASKS, TASKS
+from torchrl_safe.envs.tasks import (
+    SAFETY_TASKS,
+    TASKS,
+    SafetyButtonTask,
+    SafetyGoalTask,
+    SafetyPushTask,
+)
 from torchrl_safe.envs.tasks.velocity import VELOCITY_TASKS, VelocityTask
 
 RUNNERS: dict[str, VelocityTask] = {
@@ -17,12 +23,17 @@ NAMES = (*TASKS, *SAFETY_TASKS, *RUNNERS)
 COST_LIMIT = 25.0  # the mean cost of an episode that the field allows, in every task
 RUNNERS_EPISODE = 1000  # steps
 
+# A reached goal moves and the episode goes on: it may be trained on in pieces, of more layouts.
+ENDLESS = (SafetyGoalTask, SafetyButtonTask, SafetyPushTask)
+
 
 def follows(task: str | None) -> dict[str, Any]:
     """What other options are by default where ``env.task`` is one of Safety-Gymnasium's.
 
     Its problem is the field's: the mean cost of an episode of the task's own length is at most 25.
-    A mean is a CVaR at risk level 1.
+    A mean is a CVaR at risk level 1. Where goals move on, training keeps the shorter episodes of
+    ``env.episode_length``: with them the goal task was learned sooner
+    (docs/experiments.md, "Environments and episodes").
 
     Args:
         task (str, optional): the task's name.
@@ -38,16 +49,20 @@ def follows(task: str | None) -> dict[str, Any]:
         >>> follows("goal")
         {}
     """
+    training: dict[str, Any] = {}
     if task in SAFETY_TASKS:
         robot, navigation = SAFETY_TASKS[task]
         steps = navigation.episode_length
+        if not isinstance(navigation, ENDLESS):
+            training = {"env.episode_length": steps}
     elif task in RUNNERS:
         robot, steps = None, RUNNERS_EPISODE
+        training = {"env.episode_length": steps}
     else:
         return {}
     return {
         "env.robot": robot,
-        "env.episode_length": steps,
+        **training,
         "loss.cost_limit": COST_LIMIT,
         "loss.limit_unit": "episode",
         "loss.risk_level": 1.0,

@@ -248,6 +248,7 @@ class Trainer(ABC):
             run.counters["seconds"] += seconds
             metrics |= timeit.todict(percall=False)
             metrics["time/frames_per_second"] = batch.numel() / seconds
+            metrics["time/seconds"] = run.counters["seconds"]
             timeit.erase()
             run.log(metrics)
             progress.update(batch.numel())

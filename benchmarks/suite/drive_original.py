@@ -1,26 +1,25 @@
 r"""Drives a policy in Safety-Gymnasium itself and in ours, and prints what both say of it.
 
     python benchmarks/suite/drive_original.py runs/safetac/SafetyPointGoal1/seed_0 \
-        --python safety-gymnasium/bin/python --episodes 20
+        --python safety-gymnasium/bin/python
 
-The task is that of the run. Policies see the same numbers in both; layouts are other ones, drawn by
-each for itself, so returns and costs agree in their distribution and not one by one. Safety-
-Gymnasium steps some hundred times a second: ``--jobs`` episodes are played at a time.
+The task is that of the run. The policy sees the same numbers in both. Layouts are drawn by each for
+itself, so returns and costs of episodes agree in their distribution, and not one by one. The
+original steps some hundred times a second: twenty episodes of 1,000 steps are a minute or two.
 """
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
+from typing import Any
 
-import numpy as np
 import torch
 from scipy.stats import mannwhitneyu
 from tensordict import TensorDictBase
-from torchrl.envs import EnvBase
+from torchrl.envs import SerialEnv
 from torchrl.envs.utils import ExplorationType
 
 from torchrl_safe.envs import SafetyGymnasiumBridge
@@ -30,56 +29,62 @@ from torchrl_safe.trainers.environments import make_env
 from torchrl_safe.trainers.streams import stream_seed
 from torchrl_safe.trainers.tasks import RUNNERS, follows
 
-Policy = Callable[[TensorDictBase], TensorDictBase]
+AT_ONCE = 5  # processes of the original
 VALUES = {"return": "episode_return", "cost": "cost"}
 
 
-def play(
-    envs: Sequence[EnvBase],
-    policy: Policy,
-    episodes: int,
-    num_steps: int,
-    kind: ExplorationType,
-    seed: int,
-) -> TensorDictBase:
-    """Episodes in environments without a batch, one after the other in each, ``[episodes]``."""
-
-    def of_one(first: int) -> list[TensorDictBase]:
-        numbers = range(first, episodes, len(envs))
-        return [
-            evaluate(
-                envs[first],
-                policy,
-                num_steps=num_steps,
-                exploration_type=kind,
-                seed=(seed + number) % 2**31,
-            )
-            for number in numbers
-        ]
-
-    played = [episode for first in range(len(envs)) for episode in of_one(first)]
-    return torch.stack(played)
+def played_there(task: str, python: Path, episodes: int, policy: Any, **how: Any) -> TensorDictBase:
+    """Episodes in the original, [episodes], some at a time."""
+    make = partial(SafetyGymnasiumBridge, f"{task}-v{int(task in RUNNERS)}", python=python)
+    parts = []
+    for first in range(0, episodes, AT_ONCE):
+        env = SerialEnv(min(AT_ONCE, episodes - first), make)
+        seed = stream_seed("evaluate.py", first) % 2**31
+        parts.append(evaluate(env, policy, seed=seed, **how))
+        env.close()
+    return torch.cat(parts)
 
 
-def rows(there: TensorDictBase, here: TensorDictBase) -> dict[str, str]:
-    """Means with intervals of both, and how likely as large a difference is by chance."""
-    out = {}
+def compared(there: TensorDictBase, here: TensorDictBase) -> dict[str, str]:
+    """Means of both with 95 % intervals, and whether the difference could be chance."""
+    rows = {}
     for name, key in VALUES.items():
-        values = [played[key] for played in (there, here)]
-        for place, each in zip(("Safety-Gymnasium", "here"), values, strict=True):
-            low, high = bootstrap_interval(each)
-            out[f"{name}, {place}"] = f"{each.mean():.2f} ({low:.2f} to {high:.2f})"
-        p = mannwhitneyu(*(np.asarray(each) for each in values)).pvalue
-        out[f"{name}, Mann-Whitney test"] = f"p = {p:.2g}"
-    return out
+        for place, episodes in (("in the original", there), ("here", here)):
+            low, high = bootstrap_interval(episodes[key])
+            rows[f"{name} {place}"] = f"{episodes[key].mean():.2f} ({low:.2f} to {high:.2f})"
+        p = mannwhitneyu(there[key].numpy(), here[key].numpy()).pvalue
+        rows[f"{name}, Mann-Whitney test"] = f"p = {p:.2g}"
+    return rows
 
 
 def main(argv: Sequence[str] | None = None) -> None:
-    """Play in both, and print."""
+    """Play in both, and print.
+
+    Raises:
+        ValueError: if the policy was trained on no task of Safety-Gymnasium's.
+    """
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("policy", help="a run's folder, or the name of a policy that comes along")
-    parser.add_argument("--python", type=Path, required=True, help="that has Safety-Gymnasium")
-    parser.add_argument("--episodes", type=int, default=20)
+    parser.add_argument("--python", type=Path, required=True, help="one with Safety-Gymnasium")
+    parser.add_argument("--episodes", type=int, default=20, help="in the original")
+    parser.add_argument("--episodes-here", type=int, default=100)
     parser.add_argument("--sampled", action="store_true", help="in place of deterministic actions")
-    parser.add_argument("--seed", type=int, default=0, help="of the layouts")
     args = parser.parse_args(argv)
+    policy, options, _ = load(args.policy, partial(make_env, trust=False))
+    task = options.env.task
+    if not follows(task):
+        raise ValueError(f"{args.policy} must be of a task of Safety-Gymnasium's, got {task!r}.")
+    num_steps = follows(task)["eval.num_steps"]
+    kind = ExplorationType.RANDOM if args.sampled else ExplorationType.DETERMINISTIC
+    how = {"num_steps": num_steps, "exploration_type": kind}
+    there = played_there(task, args.python, args.episodes, policy, **how)
+    seed = stream_seed("evaluate.py", 0)
+    env = make_env(options, args.episodes_here, seed, episode_length=num_steps)
+    here = evaluate(env, policy, seed=seed, **how)
+    env.close()
+    print(f"{task}, {args.episodes} episodes in the original, {args.episodes_here} here")
+    print(format_table(compared(there, here)))
+
+
+if __name__ == "__main__":
+    main()

@@ -36,7 +36,6 @@ from side_by_side import Job, run_jobs
 
 from torchrl_safe.record import read_metrics
 from torchrl_safe.trainers import METHODS, cli
-from torchrl_safe.trainers.run import RESULTS_LIMIT
 from torchrl_safe.trainers.saved import CONFIG, read_config
 from torchrl_safe.trainers.tasks import NAMES, RUNNERS, follows
 
@@ -52,7 +51,7 @@ VARIANTS: dict[str, tuple[str, ...]] = {
 KNOWN = {**{name: (name,) for name in METHODS}, **VARIANTS}
 NAMED = [name for name in NAMES if follows(name)]
 
-OF_A_RUN = ("run_dir", "resume", "num_threads")  # and not of what it shows
+OF_A_RUN = {"run_dir", "resume", "num_threads"}  # and not of what it shows
 EVALUATIONS = 20  # during training: where a mark is reached is known to a twentieth of the run
 KINDS = {"deterministic": "eval/det/", "sampled": "eval/"}
 
@@ -146,11 +145,10 @@ def result(cell: Cell, run_dir: Path) -> dict[str, Any]:
     settings = read_config(run_dir / CONFIG)
     method, *overrides = cell.words
     wanted = cli.compose(method, overrides).settings()
-    if other := [
-        name for name in wanted if name not in OF_A_RUN and wanted[name] != settings[name]
-    ]:
+    other = [name for name in wanted.keys() - OF_A_RUN if wanted[name] != settings[name]]
+    if other:
         raise ValueError(f"{run_dir} is a run of other options than {cell.path}: {other}.")
-    finished = json.loads((run_dir / "results.json").read_text()[:RESULTS_LIMIT])
+    finished = json.loads((run_dir / "results.json").read_text())
     launches = [json.loads(line) for line in launches_of(run_dir).read_text().splitlines()]
     at, seconds = metrics["time/seconds"]
     evaluated, evaluations = metrics.get("time/eval", (at[:0], seconds[:0]))

@@ -124,6 +124,9 @@ def test_missing_extra(monkeypatch, option, backend):
     [
         ([], MOMENT_MATCHED),
         (["env.robot=jackal"], MATCHED_BOUND),
+        (["env.task=SafetyPointGoal1"], MOMENT_MATCHED),
+        (["env.task=SafetyCarGoal1"], MATCHED_BOUND),
+        (["env.task=SafetyHopperVelocity"], MATCHED_BOUND),
         (["env=gym"], MATCHED_BOUND),
         (["env.robot=jackal", "optim.kl=moment_matched"], MOMENT_MATCHED),
         (["optim.kl=matched_bound"], MATCHED_BOUND),

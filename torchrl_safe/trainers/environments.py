@@ -26,7 +26,7 @@ from torchrl.envs.batched_envs import BatchedEnvBase
 
 from torchrl_safe._costs import violation_key
 from torchrl_safe.envs import RANDOMIZATIONS
-from torchrl_safe.envs.tasks import SAFETY_TASKS
+from torchrl_safe.envs.tasks import SAFETY_TASKS, get_task
 from torchrl_safe.trainers.options import MethodOptions
 from torchrl_safe.trainers.tasks import RUNNERS
 
@@ -135,9 +135,11 @@ def _ours(
         return SafeVelocityEnv(RUNNERS[env.task], **how)
     if training:
         how = {"randomization": RANDOMIZATIONS.get(env.randomization or "")} | how
-    assert env.robot is not None  # only a runner has none
-    task = SAFETY_TASKS[env.task][1] if env.task in SAFETY_TASKS else env.task
-    return SafeRobotEnv(env.robot, task=task, **how)
+    robot: Any = env.robot
+    task: Any = env.task
+    if task in SAFETY_TASKS:
+        robot, task = get_task(task)
+    return SafeRobotEnv(robot, task=task, **how)
 
 
 def names_code(options: MethodOptions) -> str | None:

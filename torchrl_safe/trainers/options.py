@@ -31,7 +31,7 @@ from torch import nn
 from typing_extensions import Self
 
 from torchrl_safe.envs import RANDOMIZATIONS, ROBOTS
-from torchrl_safe.trainers.tasks import NAMES, RUNNERS, follows
+from torchrl_safe.trainers.tasks import NAMES, follows
 
 MOST = 2**31 - 1  # what C's int holds
 FRAMES = 2**63 - 1  # what a counter of frames holds
@@ -132,7 +132,7 @@ class Env(Group):
     )
     robot: str | None = option(
         "point",
-        "of env=robot; that of a task of Safety-Gymnasium's, null if the task has no other",
+        "of env=robot; null for a task of Safety-Gymnasium's, which has its own",
         choices=ROBOTS,
         fixed=True,
     )
@@ -474,14 +474,14 @@ class Options(Group):
             return self
         if env.name != "robot" and env.task is not None:
             raise ValueError(f"env.task must be null for env={env.name}, got {env.task!r}.")
-        if env.name == "robot" and env.robot is None and env.task not in RUNNERS:
-            raise ValueError(f"env.robot must be one of {', '.join(map(repr, ROBOTS))}, got null.")
         said, repeated = follows(env.task), given(self)
-        if "env.robot" in repeated and env.robot != said.get("env.robot", env.robot):
+        if said and "env.robot" in repeated and env.robot is not None:
             raise ValueError(
-                f"env.robot must be {said['env.robot'] or 'null'} for env.task={env.task}, got "
-                f"{env.robot or 'null'}."
+                f"env.robot must be null for env.task={env.task}, which has its own, got "
+                f"{env.robot!r}."
             )
+        if env.name == "robot" and env.robot is None and not said:
+            raise ValueError(f"env.robot must be one of {', '.join(map(repr, ROBOTS))}, got null.")
         for name in said.keys() & dict(flat(self)).keys() - repeated:
             group, _, last = name.partition(".")
             setattr(getattr(self, group), last, said[name])

@@ -10,6 +10,7 @@ from torchrl_safe.envs.tasks import (
     SafetyButtonTask,
     SafetyGoalTask,
     SafetyPushTask,
+    get_task,
 )
 from torchrl_safe.envs.tasks.velocity import VELOCITY_TASKS, VelocityTask
 
@@ -42,30 +43,36 @@ def follows(task: str | None) -> dict[str, Any]:
         dict: values by the dotted names of options; empty for tasks of other names.
 
     Examples:
-        >>> follows("SafetyCarCircle1")["env.robot"], follows("SafetyCarCircle1")["eval.num_steps"]
-        ('car', 500)
-        >>> follows("SafetyHopperVelocity")["env.robot"] is None  # the task has its own
-        True
+        >>> follows("SafetyCarCircle1")["loss.cost_limit"]
+        25.0
+        >>> follows("SafetyCarCircle1")["eval.num_steps"]
+        500
         >>> follows("goal")
         {}
     """
-    training: dict[str, Any] = {}
     if task in SAFETY_TASKS:
-        robot, navigation = SAFETY_TASKS[task]
-        steps = navigation.episode_length
-        if not isinstance(navigation, ENDLESS):
-            training = {"env.episode_length": steps}
+        _, navigation = get_task(task)
+        steps, endless = navigation.episode_length, isinstance(navigation, ENDLESS)
     elif task in RUNNERS:
-        robot, steps = None, RUNNERS_EPISODE
-        training = {"env.episode_length": steps}
+        steps, endless = RUNNERS_EPISODE, False
     else:
         return {}
     return {
-        "env.robot": robot,
-        **training,
+        "env.robot": None,  # the task has its own
+        **({} if endless else {"env.episode_length": steps}),
         "loss.cost_limit": COST_LIMIT,
         "loss.limit_unit": "episode",
         "loss.risk_level": 1.0,
         "eval.num_steps": steps,
         "video.num_steps": steps,
     }
+
+
+def robot_of(task: str | None) -> str | None:
+    """The name of the robot that one of Safety-Gymnasium's navigation tasks brings along.
+
+    Examples:
+        >>> robot_of("SafetyCarCircle1")
+        'car'
+    """
+    return get_task(task)[0].name if task in SAFETY_TASKS else None

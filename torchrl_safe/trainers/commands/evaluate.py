@@ -48,6 +48,7 @@ from torchrl_safe.trainers.safetac import SafeTAC
 from torchrl_safe.trainers.saved import from_newest
 from torchrl_safe.trainers.saved_policies import Policy, saved_policy
 from torchrl_safe.trainers.streams import stream_seed
+from torchrl_safe.trainers.tasks import RUNNERS
 from torchrl_safe.trainers.terminal import say
 
 NUM_FILMED = 9
@@ -94,7 +95,7 @@ def main(
     # Before the episodes: a run that still trains replaces its checkpoint meanwhile.
     make = env_maker(env, trust)
     options, policy, cost_losses = from_newest(run_dir, partial(load, make=make))
-    if randomization and (env or options.env.name != "robot" or options.env.robot is None):
+    if randomization and (env or options.env.name != "robot" or options.env.task in RUNNERS):
         raise ValueError(f"randomization={randomization} is of a robot, and this run has none.")
     num_steps = options.eval.num_steps
     seed = stream_seed("evaluate.py", seed)

@@ -15,16 +15,14 @@ last release in 2022, so that cells are processes of their own here.
 from __future__ import annotations
 
 import argparse
-import os
 import shlex
-import shutil
-import signal
-import subprocess
 import sys
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import NamedTuple
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+from side_by_side import Job, run_jobs
 
 ROOT = Path(__file__).parents[2]
 
@@ -98,22 +96,11 @@ def cells(
     return out
 
 
-def command(cell: Cell, root: Path, extra: Sequence[str]) -> list[str] | None:
-    """What runs a cell, or goes on with it; ``None`` if it is finished.
-
-    A run that was stopped before its first checkpoint has nothing to go on from: its folder is
-    removed.
-    """
-    run_dir = root / cell.folder
-    if (run_dir / "results.json").exists():
-        return None
+def job(cell: Cell, root: Path, extra: Sequence[str]) -> Job:
+    """What runs a cell, or goes on with it."""
     script = ROOT / "examples" / f"{cell.script}.py"
-    out = [sys.executable, str(script), *cell.overrides, *extra, f"run_dir={run_dir}"]
-    if any((run_dir / "checkpoints").glob("*")):
-        return [*out, "resume=true"]
-    if (run_dir / "config.yaml").exists():
-        shutil.rmtree(run_dir)
-    return out
+    line = (sys.executable, str(script), *cell.overrides, *extra)
+    return Job(str(cell.folder), root / cell.folder, line)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -130,52 +117,18 @@ def main(argv: Sequence[str] | None = None) -> int:
     args = parser.parse_args(argv)
 
     extra = ["num_threads=1", "video.num_steps=0", *args.set]
-    todo = []
-    for cell in cells(args.table, args.robots, args.seeds, args.methods):
-        finished = (args.root / cell.folder / "results.json").exists()
-        print(f"{'finished' if finished else 'to run':10}{cell.folder}")
-        if not finished:
-            todo.append(cell)
-
-    running: set[subprocess.Popen[bytes]] = set()
-    stopping = False
-
-    def stop(number: int, frame: object) -> None:
-        nonlocal stopping
-        stopping = True
-        for process in tuple(running):
-            process.send_signal(signal.SIGINT)  # the run saves and ends
-
-    def run(cell: Cell) -> int:
-        line = None if stopping else command(cell, args.root, extra)
-        if line is None:
-            return 0
-        log = args.root / cell.folder.parent / f"{cell.folder.name}.log"
-        log.parent.mkdir(parents=True, exist_ok=True)
-        env = {"OMP_NUM_THREADS": "1", **os.environ}
-        with log.open("ab") as file:
-            # Of a session of its own: a Ctrl-C reaches it once, from here.
-            process = subprocess.Popen(
-                line, stdout=file, stderr=file, env=env, start_new_session=True
-            )
-            running.add(process)
-            status = process.wait()
-            running.discard(process)
-        outcome = "done" if (args.root / cell.folder / "results.json").exists() else "stopped"
-        print(f"{f'status {status}' if status else outcome:10}{cell.folder}", flush=True)
-        return int(status != 0)
-
+    jobs = [
+        job(cell, args.root, extra)
+        for cell in cells(args.table, args.robots, args.seeds, args.methods)
+    ]
+    for each in jobs:
+        print(f"{'finished' if each.finished else 'to run':10}{each.name}")
     if args.dry_run:
-        for cell in todo:
-            print(shlex.join(command(cell, args.root, extra) or ()))
+        for each in jobs:
+            if not each.finished:
+                print(shlex.join(each.line()))
         return 0
-    previous = {number: signal.signal(number, stop) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        with ThreadPoolExecutor(args.jobs) as pool:
-            return sum(pool.map(run, todo))
-    finally:
-        for number, handler in previous.items():
-            signal.signal(number, handler)
+    return run_jobs(jobs, args.jobs)
 
 
 if __name__ == "__main__":

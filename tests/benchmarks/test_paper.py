@@ -28,18 +28,16 @@ class TestCells:
         folders = [c.folder for c in run_table.cells(table, ["point", "car"], [0, 1])]
         assert len(set(folders)) == len(folders)
 
-    def test_finished_interrupted_and_torn(self, tmp_path):
-        done, stopped, torn, new = run_table.cells("table_1", ["point"], [0])[:4]
-        for cell in (done, stopped, torn):
+    def test_finished_interrupted_and_new(self, tmp_path):
+        done, stopped, new = run_table.cells("table_1", ["point"], [0])[:3]
+        for cell in (done, stopped):
             (tmp_path / cell.folder).mkdir(parents=True)
             (tmp_path / cell.folder / "config.yaml").touch()
         (tmp_path / done.folder / "results.json").touch()
-        (tmp_path / stopped.folder / "checkpoints" / "step_400").mkdir(parents=True)
-        assert run_table.command(done, tmp_path, []) is None
-        assert run_table.command(stopped, tmp_path, [])[-1] == "resume=true"
-        assert "resume=true" not in run_table.command(torn, tmp_path, [])
-        assert not (tmp_path / torn.folder).exists()
-        assert f"run_dir={tmp_path / new.folder}" in run_table.command(new, tmp_path, [])
+        jobs = [run_table.job(cell, tmp_path, []) for cell in (done, stopped, new)]
+        assert [job.finished for job in jobs] == [True, False, False]
+        assert jobs[1].line()[-1] == "resume=true"
+        assert jobs[2].line()[-1] == f"run_dir={tmp_path / new.folder}"
 
     def test_runs_skips_and_counts_failures(self, tmp_path, capfd):
         """Cells are real processes: one override is impossible, so that each fails at once."""

@@ -90,7 +90,7 @@ def rewritten(path, tensors=None, **settings):
         ({"policy__num_cells": [9]}, "are not its options'"),
         ({"policy__num_cells": [10**9, 10**9]}, "must be of at most"),
         ({"policy__width": 3}, "policy.width is not an option"),
-        ({"env__robot": "tank"}, "env.robot must be one of"),
+        ({"env__robot": "tank"}, "env.robot must be null or one of"),
     ],
 )
 def test_options_that_do_not_fit(kept, settings, match):

@@ -1539,7 +1539,7 @@ IMPOSSIBLE = {
     "safety_critic.window": (1, "at least 2"),
     "safety_critic.num_updates": (0, "at least 1"),
     "env.name": ("", "a name"),
-    "env.task": ("chess", "null or one of"),
+    "env.task": ("chess", "or a task of Safety-Gymnasium's"),
     "env.id": ("", "null or a name"),
     "env.cost": ("", "null or a name"),
     "env.robot": ("unicycle", "'point'"),

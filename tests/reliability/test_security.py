@@ -522,10 +522,10 @@ def change_config(run_dir: Path, **options: object) -> None:
 @pytest.mark.parametrize(
     ("options", "match"),
     [
-        ({"env__robot": "${oc.env:SECRET}"}, "env.robot must be one of"),
+        ({"env__robot": "${oc.env:SECRET}"}, "env.robot must be null or one of"),
         ({"${oc.env:SECRET}": 1}, "is not an option"),
         ({"method": "os:system"}, "method must be one of"),
-        ({"env__robot": "\x1b[2J"}, "env.robot must be one of"),
+        ({"env__robot": "\x1b[2J"}, "env.robot must be null or one of"),
         ({"\x1b[2J": 1}, "impossible key"),
         ({"unknown": 1}, "unknown is not an option"),
         ({"policy__num_cells": [10**9, 10**9]}, "must be of at most"),

@@ -9,7 +9,7 @@ import pytest
 import small
 import torch
 from torch import nn
-from torchrl.envs import GymEnv, ParallelEnv, SerialEnv, TransformedEnv
+from torchrl.envs import GymEnv, ParallelEnv, SerialEnv, StepCounter, TransformedEnv
 
 from torchrl_safe import record
 from torchrl_safe.envs import CostFunction
@@ -96,7 +96,7 @@ class TestCommandLine:
     @pytest.mark.parametrize(
         ("overrides", "message"),
         [
-            (["env=gim"], "env.name must be one of 'robot', 'gym', 'velocity', or module:function"),
+            (["env=gim"], "env.name must be one of 'robot', 'gym' or module:function"),
             (["env=no_module:make"], "env.name=no_module:make cannot be imported"),
             (["env=math:nothing"], "env.name=math:nothing must be a function"),
             (["env=gym"], "env.id must name an environment for env=gym, got null"),
@@ -109,10 +109,20 @@ class TestCommandLine:
         with pytest.raises(ValueError, match=message):
             METHODS["cpo"](options=options).train()
 
-    def test_velocity_task(self, tmp_path):
-        options = small.options("trc", "env=velocity", "env.id=hopper", run_dir=tmp_path / "run")
-        env = make_env(options, 3, 0, training=True)
-        assert env.reset()["observation"].shape == (3, 11)
+    @pytest.mark.parametrize(
+        ("make", "longest"),
+        [(pendulum, 200), (lambda: pendulum().append_transform(StepCounter(max_steps=150)), 150)],
+        ids=["gymnasium", "step counter"],
+    )
+    def test_limit_of_longer_episodes_than_there_are(self, tmp_path, make, longest):
+        """A sum over steps that no episode has is a looser limit than the one that is read."""
+        run_dir = str(tmp_path / "run")
+        how = {"limit_unit": "episode", "eval.num_steps": longest + 1, "run_dir": run_dir}
+        message = f"eval.num_steps must be at most {longest}, the length .*=episode, got"
+        with pytest.raises(ValueError, match=message):
+            CPO(make, **HOW | EPISODES | how).train()
+        options = CPO(make, **HOW | EPISODES | how | {"limit_unit": "step"}).options
+        assert make_env(options, 2, 0, source=make).batch_size == (2,)
 
 
 class TestFromPython:

@@ -58,7 +58,7 @@ class TestEveryMethod:
             1.5,
             "num_threads must be an integer of .* at most 2147483647, got 1.5",
         ),
-        ("env.robot", "unicycle", "env.robot must be one of 'point'.*got 'unicycle'"),
+        ("env.robot", "unicycle", "env.robot must be null or one of 'point'.*got 'unicycle'"),
         ("loss.risk_level", 2, r"loss.risk_level must be a number in \(0, 1\], got 2"),
         ("num_threads", 2**31, "num_threads must be an integer .*, got 2147483648"),
         ("loss.cost_limit", 1e300, r"loss.cost_limit must be a number in .* got 1e\+300"),
@@ -124,6 +124,9 @@ def test_missing_extra(monkeypatch, option, backend):
     [
         ([], MOMENT_MATCHED),
         (["env.robot=jackal"], MATCHED_BOUND),
+        (["env.task=SafetyPointGoal1"], MOMENT_MATCHED),
+        (["env.task=SafetyCarGoal1"], MATCHED_BOUND),
+        (["env.task=SafetyHopperVelocity"], MATCHED_BOUND),
         (["env=gym"], MATCHED_BOUND),
         (["env.robot=jackal", "optim.kl=moment_matched"], MOMENT_MATCHED),
         (["optim.kl=matched_bound"], MATCHED_BOUND),

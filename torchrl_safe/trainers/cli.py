@@ -1,6 +1,7 @@
 """The command ``torchrl-safe``: train a method, or do something with a run.
 
     torchrl-safe train safetac env.robot=point
+    torchrl-safe train safetac env.task=SafetyPointGoal1
     torchrl-safe train cpo env=gym env.id=Pendulum-v1 env.cost=my_costs:speed
     torchrl-safe train trc --multirun seed=0,1,2
     torchrl-safe evaluate runs/safetac/point/seed_0
@@ -31,6 +32,7 @@ from torchrl.checkpoint import CheckpointError
 from torchrl_safe.trainers.commands import evaluate, export, play, report, watch
 from torchrl_safe.trainers.methods import METHODS
 from torchrl_safe.trainers.options import Options, flat
+from torchrl_safe.trainers.tasks import follows
 
 CANNOT = (CheckpointError, ModuleNotFoundError, OSError, ValueError)  # with what to do about it
 
@@ -115,19 +117,20 @@ def run(
         arguments (sequence of str, optional): defaults to the process's.
         **defaults: other defaults of options of the top level.
     """
-    name = register(method, **defaults)
+    arguments = [*map(spelled_out, sys.argv[1:] if arguments is None else arguments)]
+    standard = defaults_for(method, arguments)
+    name = register(standard, **defaults)
 
     def main(cfg: DictConfig) -> None:
         try:
-            go(options_of(method, cfg, **defaults))
+            go(options_of(standard, cfg))
         except CANNOT as error:
             if not _is_ours(error):
                 raise
             # Of which hydra shows the message alone, and with HYDRA_FULL_ERROR=1 everything.
             raise CompactHydraException(f"torchrl-safe train: {error}") from error
 
-    arguments = sys.argv[1:] if arguments is None else arguments
-    before, sys.argv = sys.argv, [sys.argv[0], *map(spelled_out, arguments)]
+    before, sys.argv = sys.argv, [sys.argv[0], *arguments]
     try:
         hydra.main(config_path=None, config_name=name, version_base="1.3")(main)()
     finally:
@@ -137,15 +140,28 @@ def run(
 def compose(method: str, overrides: Sequence[str] = (), **defaults: Any) -> Any:
     """The options of a method with overrides as on the command line."""
     overrides = [*map(spelled_out, overrides)]
-    name = register(method, **defaults)
+    standard = defaults_for(method, overrides)
+    name = register(standard, **defaults)
     with hydra.initialize(config_path=None, version_base="1.3"):
         cfg = hydra.compose(name, overrides)
-    return options_of(method, cfg, overrides, **defaults)
+    return options_of(standard, cfg, overrides)
 
 
-def register(method: str, **defaults: Any) -> str:
+def defaults_for(method: str, arguments: Sequence[str]) -> Any:
+    """The options of a method of which at most the task is given, as hydra's arguments say it.
+
+    What is printed by ``--cfg job`` is then what follows from the task. A sweep over tasks prints
+    the defaults of none, and every job of it follows its own.
+    """
+    options = Options.known[method]
+    words = [word.lstrip("+").partition("=") for word in arguments]
+    tasks = [value for name, _, value in words if name == "env.task"]
+    return options.of(**{"env.task": tasks[-1]}) if tasks and follows(tasks[-1]) else options()
+
+
+def register(standard: Options, **defaults: Any) -> str:
     """Give hydra the defaults of a method; the name that it knows them by."""
-    settings = Options.known[method]().model_dump() | defaults
+    method, settings = standard.method, standard.model_dump() | defaults
     defaults_list = [
         "_self_",
         {"override hydra/job_logging": "none"},
@@ -155,9 +171,7 @@ def register(method: str, **defaults: Any) -> str:
     return method
 
 
-def options_of(
-    method: str, cfg: DictConfig, overrides: Sequence[str] | None = None, **defaults: Any
-) -> Any:
+def options_of(standard: Options, cfg: DictConfig, overrides: Sequence[str] | None = None) -> Any:
     """Options of what hydra composed.
 
     Given are those that an override names, and those that differ from the defaults: a caller who
@@ -168,17 +182,17 @@ def options_of(
     words = OverridesParser.create().parse_overrides(list(overrides))
     keys = [word.key_or_group for word in words]
     values: Any = OmegaConf.to_container(cfg, resolve=True)
-    standard = dict(flat(Options.known[method]()))
+    defaults = dict(flat(standard))
 
     def named(name: str) -> bool:
         return any(name == key or name.startswith(f"{key}.") for key in keys)
 
     given = {
         name: value
-        for name, value in _leaves(values, standard)
-        if named(name) or name not in standard or standard[name] != value
+        for name, value in _leaves(values, defaults)
+        if named(name) or name not in defaults or defaults[name] != value
     }
-    return Options.known[method].of(**given)
+    return type(standard).of(**given)
 
 
 def spelled_out(argument: str) -> str:

@@ -13,8 +13,10 @@ from tensordict import TensorDictBase
 from torchrl.data import Binary, Composite, TensorSpec
 from torchrl.envs import (
     CatTensors,
+    Compose,
     DoubleToFloat,
     EnvBase,
+    GymWrapper,
     SerialEnv,
     StepCounter,
     Transform,
@@ -24,7 +26,9 @@ from torchrl.envs.batched_envs import BatchedEnvBase
 
 from torchrl_safe._costs import violation_key
 from torchrl_safe.envs import RANDOMIZATIONS
+from torchrl_safe.envs.tasks import SAFETY_TASKS, get_task
 from torchrl_safe.trainers.options import MethodOptions
+from torchrl_safe.trainers.tasks import RUNNERS
 
 MakeEnv = Callable[..., EnvBase]
 NOT_INPUTS = ("violation", "violations", "goal_met", "diverged", "step_count")
@@ -42,7 +46,7 @@ def make_env(
     training: bool = False,
     source: MakeEnv | None = None,
     trust: bool = True,
-    **of_robots: Any,
+    **how: Any,
 ) -> EnvBase:
     """A batch of environments, ``[num_envs]``.
 
@@ -63,13 +67,14 @@ def make_env(
             ``num_envs`` times.
         trust (bool): whether functions that the options name may be imported. Defaults to True;
             false for options that come with somebody's files.
-        **of_robots: of the constructor, where ``env.name`` is ``robot``.
+        **how: of the constructor, where ``env.name`` is ``robot``: ``episode_length`` is
+            ``eval.num_steps`` where it is not to train in.
 
     Raises:
         UntrustedError: if ``trust`` is false and the options name code.
         ValueError: if there is no such environment, or it has no cost.
     """
-    env = _make_env(options, num_envs, seed, training, source, trust, of_robots)
+    env = _make_env(options, num_envs, seed, training, source, trust, how)
     rewards = list(env.full_reward_spec.keys(True, True))
     if missing := [name for name in cost_names(options) if name not in rewards]:
         raise ValueError(
@@ -86,60 +91,55 @@ def _make_env(
     training: bool,
     source: MakeEnv | None,
     trust: bool,
-    of_robots: dict[str, Any],
+    how: dict[str, Any],
 ) -> EnvBase:
-    name, device = options.env.name, options.device
+    name = options.env.name
     if source is None and not trust and (code := names_code(options)) is not None:
         raise UntrustedError(
             f"the configuration names code, {code}: pass the environment itself (env, or --env "
             "module:function), or say that you trust it (trust=True, or --trust)."
         )
     if source is not None:
-        return _completed(_batched(source, num_envs, seed), options)
+        return _completed(_batched(source, num_envs, seed, options), options)
     if name == "robot":
-        from torchrl_safe.envs import SafeRobotEnv
-
-        if training:
-            of_robots = {
-                "episode_length": options.env.episode_length,
-                "stagger": True,
-                "randomization": RANDOMIZATIONS.get(options.env.randomization or ""),
-                **of_robots,
-            }
-        return SafeRobotEnv(
-            options.env.robot,
-            task=options.env.task,
-            num_envs=num_envs,
-            num_threads=options.num_threads,
-            seed=seed,
-            device=device,
-            **of_robots,
-        )
+        return _ours(options, num_envs, seed, training, how)
     if name == "python":
         raise ValueError("the run's environment was made in Python: pass it as env.")
-    if options.env.id is None and name in ("velocity", "gym"):
-        raise ValueError(f"env.id must name an environment for env={name}, got null.")
-    if name == "velocity":
-        from torchrl_safe.envs import SafeVelocityEnv
-
-        how: dict[str, Any] = (
-            {"episode_length": options.env.episode_length, "stagger": True} if training else {}
-        )
-        task: Any = options.env.id
-        return SafeVelocityEnv(
-            task,
-            num_envs=num_envs,
-            num_threads=options.num_threads,
-            seed=seed,
-            device=device,
-            **how,
-        )
+    if name == "gym" and options.env.id is None:
+        raise ValueError("env.id must name an environment for env=gym, got null.")
     if name == "gym":
-        env = _batched(_gym_maker(options), num_envs, seed)
+        env = _batched(_gym_maker(options), num_envs, seed, options)
         if training:
             env = TransformedEnv(env, StepCounter(max_steps=options.env.episode_length))
         return _completed(env, options)
-    return _completed(_batched(imported("env.name", name), num_envs, seed), options)
+    return _completed(_batched(imported("env.name", name), num_envs, seed, options), options)
+
+
+def _ours(
+    options: MethodOptions, num_envs: int, seed: int, training: bool, how: dict[str, Any]
+) -> EnvBase:
+    """Robots of ours, by robot and task."""
+    from torchrl_safe.envs import SafeRobotEnv, SafeVelocityEnv
+
+    env = options.env
+    how = {
+        "num_envs": num_envs,
+        "num_threads": options.num_threads,
+        "seed": seed,
+        "device": options.device,
+        "episode_length": env.episode_length if training else options.eval.num_steps,
+        "stagger": training,
+        **how,
+    }
+    if env.task in RUNNERS:
+        return SafeVelocityEnv(RUNNERS[env.task], **how)
+    if training:
+        how = {"randomization": RANDOMIZATIONS.get(env.randomization or "")} | how
+    robot: Any = env.robot
+    task: Any = env.task
+    if task in SAFETY_TASKS:
+        robot, task = get_task(task)
+    return SafeRobotEnv(robot, task=task, **how)
 
 
 def names_code(options: MethodOptions) -> str | None:
@@ -163,7 +163,7 @@ def imported(option: str, name: str) -> Callable[..., Any]:
     module, colon, function = name.partition(":")
     if not colon:
         raise ValueError(
-            f"{option} must be one of 'robot', 'gym', 'velocity', or module:function, got {name!r}."
+            f"{option} must be one of 'robot', 'gym' or module:function, got {name!r}."
             if option == "env.name"
             else f"{option} must be module:function, got {name!r}."
         )
@@ -237,7 +237,7 @@ def _gym_maker(options: MethodOptions) -> MakeEnv:
     return make
 
 
-def _batched(make: MakeEnv, num_envs: int, seed: int) -> EnvBase:
+def _batched(make: MakeEnv, num_envs: int, seed: int, options: MethodOptions) -> EnvBase:
     """``num_envs`` environments of a function that makes one, or as many as it is asked for."""
     takes = inspect.signature(make).parameters
     if "num_envs" in takes:
@@ -246,6 +246,7 @@ def _batched(make: MakeEnv, num_envs: int, seed: int) -> EnvBase:
     else:
         env = make()
         if not env.batch_size:
+            _check_episode(env, options)
             env.close()
             env = SerialEnv(num_envs, make)
     if "seed" not in takes or "num_envs" not in takes:
@@ -255,6 +256,32 @@ def _batched(make: MakeEnv, num_envs: int, seed: int) -> EnvBase:
             f"env must have a batch of one dimension or none, got {tuple(env.batch_size)}."
         )
     return env
+
+
+def _check_episode(env: EnvBase, options: MethodOptions) -> None:
+    """A limit on an episode of ``eval.num_steps`` is another one where episodes are shorter."""
+    if getattr(options.loss, "limit_unit", None) != "episode":  # type: ignore[attr-defined]
+        return
+    steps, longest = options.eval.num_steps, _time_limit(env)
+    if longest is not None and steps > longest:
+        env.close()
+        raise ValueError(
+            f"eval.num_steps must be at most {longest}, the length of the environment's episodes, "
+            f"for loss.limit_unit=episode, got {steps}."
+        )
+
+
+def _time_limit(env: EnvBase) -> int | None:
+    """The steps after which an environment truncates its episodes, where it tells."""
+    limits = []
+    while isinstance(env, TransformedEnv):
+        transform = env.transform
+        parts = transform if isinstance(transform, Compose) else [transform]
+        limits += [part.max_steps for part in parts if isinstance(part, StepCounter)]
+        env = env.base_env
+    if isinstance(env, GymWrapper):
+        limits.append(getattr(env.spec, "max_episode_steps", None))
+    return min((limit for limit in limits if limit is not None), default=None)
 
 
 def _completed(env: EnvBase, options: MethodOptions) -> EnvBase:

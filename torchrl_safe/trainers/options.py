@@ -31,7 +31,7 @@ from torch import nn
 from typing_extensions import Self
 
 from torchrl_safe.envs import RANDOMIZATIONS, ROBOTS
-from torchrl_safe.envs.tasks import TASKS
+from torchrl_safe.trainers.tasks import NAMES, follows
 
 MOST = 2**31 - 1  # what C's int holds
 FRAMES = 2**63 - 1  # what a counter of frames holds
@@ -125,18 +125,27 @@ class Env(Group):
 
     name: str = option(
         "robot",
-        "what to train in: a robot of ours (robot), a Gymnasium environment (gym), a velocity task "
-        "of ours (velocity), or module:function, which returns a TorchRL environment with a cost",
+        "what to train in: a robot of ours (robot), a Gymnasium environment (gym), or "
+        "module:function, which returns a TorchRL environment with a cost",
         min_length=1,
         fixed=True,
     )
-    robot: str = option("point", "of env=robot", choices=ROBOTS, fixed=True)
+    robot: str | None = option(
+        "point",
+        "of env=robot; null for a task of Safety-Gymnasium's, which has its own",
+        choices=ROBOTS,
+        fixed=True,
+    )
     task: str | None = option(
-        None, "of env=robot: another task than the robot's own", choices=TASKS, fixed=True
+        None,
+        "of env=robot: another task than the robot's own; one of Safety-Gymnasium's brings its "
+        "robot, episodes and limit along",
+        choices=NAMES,
+        allowed="null, 'goal', 'navigation', 'navigation_speed' or a task of Safety-Gymnasium's, "
+        "such as 'SafetyPointGoal1' and 'SafetyHopperVelocity'",
+        fixed=True,
     )
-    id: str | None = option(
-        None, "of env=gym: the environment's; of env=velocity: the task's", min_length=1
-    )
+    id: str | None = option(None, "of env=gym: the environment's", min_length=1)
     cost: str | None = option(None, "of env=gym: module:function, the cost of a step", min_length=1)
     num_envs: int = option(
         400,
@@ -436,7 +445,10 @@ class Options(Group):
         if self.run_dir is not None:
             return self.run_dir
         env = getattr(self, "env", None)
-        names = [] if env is None else [env.robot if env.name == "robot" else env.id or env.name]
+        names = []
+        if env is not None:
+            ours = env.task if follows(env.task) else env.robot
+            names = [ours if env.name == "robot" else env.id or env.name]
         return "/".join(["runs", self.method, *names, f"seed_{self.seed}"])
 
     def check_installed(self) -> None:
@@ -453,6 +465,28 @@ class Options(Group):
                     f"{name}={extra} needs a package: pip install 'torchrl-safe[{extra}]'; "
                     f"{name}={plain} needs none."
                 )
+
+    @model_validator(mode="after")
+    def _follow_task(self) -> Self:
+        """Options that nobody has given are what the task says."""
+        env = getattr(self, "env", None)
+        if not isinstance(env, Env):
+            return self
+        if env.name != "robot" and env.task is not None:
+            raise ValueError(f"env.task must be null for env={env.name}, got {env.task!r}.")
+        said, repeated = follows(env.task), given(self)
+        if said and "env.robot" in repeated and env.robot is not None:
+            raise ValueError(
+                f"env.robot must be null for env.task={env.task}, which has its own, got "
+                f"{env.robot!r}."
+            )
+        if env.name == "robot" and env.robot is None and not said:
+            raise ValueError(f"env.robot must be one of {', '.join(map(repr, ROBOTS))}, got null.")
+        for name in said.keys() & dict(flat(self)).keys() - repeated:
+            group, _, last = name.partition(".")
+            setattr(getattr(self, group), last, said[name])
+            getattr(self, group).model_fields_set.discard(last)  # nobody has given it
+        return self
 
     @model_validator(mode="after")
     def _check_together(self) -> Self:

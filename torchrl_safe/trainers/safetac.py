@@ -39,6 +39,7 @@ from torchrl_safe.trainers.options import (
     option,
 )
 from torchrl_safe.trainers.policy_steps import PID, Multiplier, ascend, make_trust_region
+from torchrl_safe.trainers.tasks import robot_of
 from torchrl_safe.trainers.trainer import ConstrainedTrainer
 
 
@@ -289,5 +290,6 @@ def choose_distance(options: SafeTACOptions) -> Distance:
     """
     if options.optim.kl != "auto":
         return DISTANCES[options.optim.kl]
-    on_point = options.env.name == "robot" and options.env.robot == "point"
+    env = options.env
+    on_point = env.name == "robot" and "point" in (env.robot, robot_of(env.task))
     return DISTANCES["moment_matched" if on_point else "matched_bound"]

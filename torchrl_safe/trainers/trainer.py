@@ -30,6 +30,7 @@ from torchrl_safe.trainers.networks import MakeNetwork, is_discrete, make_critic
 from torchrl_safe.trainers.options import ConstrainedLoss, MethodOptions, flat, per_episode
 from torchrl_safe.trainers.run import Run
 from torchrl_safe.trainers.streams import stream_seed
+from torchrl_safe.trainers.tasks import follows
 from torchrl_safe.trainers.terminal import GracefulStop, Progress, say
 
 WIDTHS = ("env.num_envs", "eval.num_episodes", "eval.final_episodes")  # of batches
@@ -39,9 +40,10 @@ class Trainer(ABC):
     """A method. It says what it is made of in :meth:`build`, and what it does in :meth:`update`.
 
     Args:
-        env (str, EnvBase or callable, optional): what to train in: the name of a robot of ours, a
-            TorchRL environment with a cost in its reward spec, or a function that makes one, from
-            the keywords ``num_envs`` and ``seed`` if it has them. By default what the options say.
+        env (str, EnvBase or callable, optional): what to train in: the name of a robot of ours or
+            of one of Safety-Gymnasium's tasks, a TorchRL environment with a cost in its reward
+            spec, or a function that makes one, from the keywords ``num_envs`` and ``seed`` if it
+            has them. By default what the options say.
 
     Keyword Args:
         in_keys (sequence of str): what the networks read. Defaults to ``"observation"``, which
@@ -74,12 +76,12 @@ class Trainer(ABC):
         self.source: Callable[..., EnvBase] | None = None
         width = None
         if isinstance(env, str):
-            if env not in ROBOTS:
+            if env not in ROBOTS and not follows(env):
                 raise ValueError(
-                    f"env must be a TorchRL environment, a function that makes one or one of "
-                    f"{', '.join(map(repr, ROBOTS))}, got {env!r}."
+                    f"env must be a TorchRL environment, a function that makes one, a task of "
+                    f"Safety-Gymnasium's or one of {', '.join(map(repr, ROBOTS))}, got {env!r}."
                 )
-            named["env.robot"] = env
+            named["env.robot" if env in ROBOTS else "env.task"] = env
         elif env is not None:
             self.source, width = source_of(env)
             named.setdefault("env.name", "python")
@@ -245,6 +247,7 @@ class Trainer(ABC):
             run.counters["seconds"] += seconds
             metrics |= timeit.todict(percall=False)
             metrics["time/frames_per_second"] = batch.numel() / seconds
+            metrics["time/seconds"] = run.counters["seconds"]
             timeit.erase()
             run.log(metrics)
             progress.update(batch.numel(), **self.standing(metrics))

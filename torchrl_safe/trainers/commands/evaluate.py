@@ -48,6 +48,7 @@ from torchrl_safe.trainers.safetac import SafeTAC
 from torchrl_safe.trainers.saved import from_newest
 from torchrl_safe.trainers.saved_policies import Policy, saved_policy
 from torchrl_safe.trainers.streams import stream_seed
+from torchrl_safe.trainers.tasks import RUNNERS
 from torchrl_safe.trainers.terminal import say
 
 NUM_FILMED = 9
@@ -94,17 +95,14 @@ def main(
     # Before the episodes: a run that still trains replaces its checkpoint meanwhile.
     make = env_maker(env, trust)
     options, policy, cost_losses = from_newest(run_dir, partial(load, make=make))
-    if randomization and (env or options.env.name != "robot"):
+    if randomization and (env or options.env.name != "robot" or options.env.task in RUNNERS):
         raise ValueError(f"randomization={randomization} is of a robot, and this run has none.")
     num_steps = options.eval.num_steps
     seed = stream_seed("evaluate.py", seed)
     out = run_dir / (f"evaluation_{randomization}" if randomization else "evaluation")
     make_folder(out)
-    of_robots = {
-        "episode_length": num_steps,
-        "randomization": RANDOMIZATIONS.get(randomization or ""),
-    }
-    envs = make(options, episodes, seed, **of_robots)
+    how = {"randomization": RANDOMIZATIONS[randomization]} if randomization else {}
+    envs = make(options, episodes, seed, **how)
     goals = "goal_met" in envs.full_observation_spec.keys()
     metrics: dict[str, float] = {}
     episodes_played = {}
@@ -145,7 +143,7 @@ def main(
     say(format_table(metrics))
     envs.close()
     if film:
-        small = make(options, filmed, seed, **of_robots)
+        small = make(options, filmed, seed, **how)
         try:
             record_video(
                 small,

@@ -3,7 +3,8 @@
     torchrl-safe play safetac-point             # one of torchrl_safe.policies.names()
     torchrl-safe play runs/trc/point/seed_0     # a run's policy
 
-Writes ``<name>.mp4`` where it is started and prints a table.
+Writes ``<name>.mp4`` where it is started and prints a table. Of a folder that is called after its
+seed alone, the name is those of the folders above it, too: ``trc_point_seed_0.mp4``.
 """
 
 from __future__ import annotations
@@ -55,7 +56,7 @@ def main(
         episodes (int): how many, with deterministic actions.
         steps (int, optional): per episode. Defaults to the run's ``eval.num_steps``.
         seed (int): of the layouts.
-        out (path, optional): the film. Defaults to ``<name>.mp4`` where it is started.
+        out (path, optional): the film. Defaults to :func:`film_of` the name.
         env (str, optional): ``module:function`` that makes the environment.
         trust (bool): whether functions that a run's options name may be imported.
 
@@ -83,7 +84,7 @@ def main(
         path = record_video(
             envs,
             policy,
-            out or Path(f"{expand(name).name}.mp4"),
+            out or film_of(name),
             num_steps=steps,
             width=320,
             height=240,
@@ -95,6 +96,21 @@ def main(
         say(f"no video: {error}")
     envs.close()
     return metrics
+
+
+def film_of(name: str) -> Path:
+    """The file of a film, where it is started.
+
+    Examples:
+        >>> str(film_of("safetac-point")), str(film_of("runs/mine"))
+        ('safetac-point.mp4', 'mine.mp4')
+        >>> str(film_of("runs/trc/point/seed_0")), str(film_of("runs/safetac_point/seed_1"))
+        ('trc_point_seed_0.mp4', 'safetac_point_seed_1.mp4')
+    """
+    *above, last = expand(name).absolute().parts
+    if last.startswith("seed_"):
+        last = "_".join([*(part for part in above[-2:] if part != "runs"), last])
+    return Path(f"{last}.mp4")
 
 
 def load(name: str, make: Callable[..., EnvBase]) -> SavedPolicy:

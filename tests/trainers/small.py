@@ -30,6 +30,10 @@ OF_METHOD = {
     "sac_lagrangian": GRADIENT,
     "trc": SURROGATE,
     "cpo": SURROGATE,
+    "ppo_lagrangian": SURROGATE,
+    "ppo_pid": SURROGATE,
+    "trpo_lagrangian": SURROGATE,
+    "trpo_pid": SURROGATE,
     "offpolicy_trc": [*SURROGATE, *REPLAY],
 }
 

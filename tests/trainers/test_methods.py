@@ -39,6 +39,10 @@ CASES = {
     "sac_lagrangian": ("sac_lagrangian", GRADIENT, {"update/loss_actor", "update/multiplier"}),
     "cpo": ("cpo", SURROGATE, {"update/kl", "update/loss_cost_value"}),
     "trc": ("trc", SURROGATE, {"update/kl", "update/loss_cost_variance"}),
+    **{
+        name: (name, SURROGATE, {"update/kl", "update/loss_value", "update/multiplier"})
+        for name in ("ppo_lagrangian", "ppo_pid", "trpo_lagrangian", "trpo_pid")
+    },
     "offpolicy_trc": ("offpolicy_trc", [*SURROGATE, *REPLAY], {"update/kl", "update/loss_value"}),
     "safetac_lagrangian": (
         "safetac",

@@ -32,7 +32,7 @@ from torchrl_safe.trainers.options import (
     again,
     option,
 )
-from torchrl_safe.trainers.policy_steps import Multiplier
+from torchrl_safe.trainers.policy_steps import make_multiplier
 from torchrl_safe.trainers.trainer import ConstrainedTrainer
 
 
@@ -78,7 +78,7 @@ class WCSAC(ConstrainedTrainer):
         self.targets = [SoftUpdate(loss, tau=options.optim.tau) for loss in losses]
         optim = joint_optim(losses, options.optim.lr)
         self.steps = FiniteSteps(optim, max_skipped=options.optim.max_skipped)
-        self.multiplier = Multiplier(len(self.costs), options.lagrangian, None, options.device)
+        self.multiplier = make_multiplier(self)
         self.buffer = make_buffer(self)
         return {
             "reward_loss": self.reward_loss,
@@ -95,7 +95,7 @@ class WCSAC(ConstrainedTrainer):
             return {}
         limits = self.limits()
         levels = {cost: loss.on_policy_cvar(batch) for cost, loss in self.cost_losses.items()}
-        self.multiplier.update(torch.stack([levels[cost] - limits[cost] for cost in limits]))
+        priced = self.multiplier.react(self, levels)
         with timeit("time/update"):
             for _ in range(self.options.optim.num_updates):
                 minibatch = self.buffer.sample()
@@ -104,11 +104,9 @@ class WCSAC(ConstrainedTrainer):
                 self.steps.step(losses)
                 for target in self.targets:
                     target.step()
-        prices = dict(zip(limits, self.multiplier().tolist(), strict=True))
         return {
             **{f"update/{name}": value.item() for name, value in losses.items()},
-            **self.named("update/multiplier", prices),
-            **self.levels(levels),
+            **priced,
             "update/skipped_steps": float(self.steps.count()),
             "update/alpha": self.reward_loss.log_alpha.exp().item(),
         }

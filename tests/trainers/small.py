@@ -28,6 +28,7 @@ OF_METHOD = {
     "tac": GRADIENT,
     "wcsac": GRADIENT,
     "sac_lagrangian": GRADIENT,
+    "sac_pid": GRADIENT,
     "trc": SURROGATE,
     "cpo": SURROGATE,
     "ppo_lagrangian": SURROGATE,

@@ -15,12 +15,13 @@ from torchrl_safe.trainers.tac import TAC
 from torchrl_safe.trainers.trainer import ConstrainedTrainer, Trainer
 from torchrl_safe.trainers.trc import CPO, TRC
 from torchrl_safe.trainers.trpo_lagrangian import TRPOPID, TRPOLagrangian
-from torchrl_safe.trainers.wcsac import WCSAC, SACLagrangian
+from torchrl_safe.trainers.wcsac import SACPID, WCSAC, SACLagrangian
 
 __all__ = [
     "CPO",
     "METHODS",
     "PPOPID",
+    "SACPID",
     "TAC",
     "TRC",
     "TRPOPID",

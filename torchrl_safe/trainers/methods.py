@@ -9,12 +9,12 @@ from torchrl_safe.trainers.tac import TAC
 from torchrl_safe.trainers.trainer import Trainer
 from torchrl_safe.trainers.trc import CPO, TRC
 from torchrl_safe.trainers.trpo_lagrangian import TRPOPID, TRPOLagrangian
-from torchrl_safe.trainers.wcsac import WCSAC, SACLagrangian
+from torchrl_safe.trainers.wcsac import SACPID, WCSAC, SACLagrangian
 
 METHODS: dict[str, type[Trainer]] = {
     method.Options.method: method
     for method in (
-        *(SafeTAC, TAC, WCSAC, SACLagrangian),
+        *(SafeTAC, TAC, WCSAC, SACLagrangian, SACPID),
         *(TRC, CPO, OffPolicyTRC),
         *(PPOLagrangian, PPOPID, TRPOLagrangian, TRPOPID),
     )

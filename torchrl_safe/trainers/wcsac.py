@@ -1,4 +1,4 @@
-"""WCSAC (Yang et al. 2021), and SAC-Lagrangian (Ha et al. 2020), which limits the mean cost."""
+"""WCSAC (Yang et al. 2021); SAC-Lagrangian (Ha et al. 2020) and SAC-PID limit the mean cost."""
 
 from __future__ import annotations
 
@@ -26,13 +26,14 @@ from torchrl_safe.trainers.off_policy import (
 )
 from torchrl_safe.trainers.options import (
     ConstrainedLoss,
+    InitialPrice,
     Lagrangian,
     MethodOptions,
     ReplayBuffer,
     again,
     option,
 )
-from torchrl_safe.trainers.policy_steps import make_multiplier
+from torchrl_safe.trainers.policy_steps import PID, make_multiplier
 from torchrl_safe.trainers.trainer import ConstrainedTrainer
 
 
@@ -43,14 +44,19 @@ class WCSACLoss(ConstrainedLoss):
     alpha: float = option(0.01, "entropy weight to start with; it is tuned", gt=0, fixed=True)
 
 
-class WCSACOptions(MethodOptions):
-    """The options of WCSAC."""
-
-    method: ClassVar[str] = "wcsac"
+class SoftOptions(MethodOptions):
+    """What the options of these methods have."""
 
     replay_buffer: ReplayBuffer = Field(default_factory=ReplayBuffer)
     loss: WCSACLoss = Field(default_factory=WCSACLoss)
     optim: SoftUpdates = Field(default_factory=SoftUpdates)
+
+
+class WCSACOptions(SoftOptions):
+    """The options of WCSAC."""
+
+    method: ClassVar[str] = "wcsac"
+
     lagrangian: Lagrangian = Field(default_factory=Lagrangian)
 
 
@@ -151,4 +157,25 @@ class SACLagrangian(WCSAC):
         >>> policy = SACLagrangian("point").train(total_frames=1_000_000)  # doctest: +SKIP
     """
 
-    Options = SACLagrangianOptions
+    Options: ClassVar[type[MethodOptions]] = SACLagrangianOptions
+
+
+class SACPIDOptions(SoftOptions):
+    """The options of SAC-PID."""
+
+    method: ClassVar[str] = "sac_pid"
+
+    loss: SACLagrangianLoss = Field(default_factory=SACLagrangianLoss)
+    lagrangian: InitialPrice = Field(default_factory=InitialPrice)
+    pid: PID = Field(default_factory=PID)
+
+
+class SACPID(SACLagrangian):
+    """SAC-Lagrangian with a multiplier that a PID controller sets.
+
+    Examples:
+        >>> from torchrl_safe.trainers import SACPID
+        >>> policy = SACPID("point").train(total_frames=1_000_000)  # doctest: +SKIP
+    """
+
+    Options = SACPIDOptions

@@ -21,6 +21,20 @@ class TestLagrangian:
         expected = [shares[0] * 2 - shares[1] * 2 * 1.0, shares[0] * 2 - shares[2]]
         torch.testing.assert_close(x.grad, torch.tensor(expected, dtype=torch.float64))
 
+    def test_of_several_is_that_of_each(self):
+        rng = np.random.default_rng(0)
+        objective, constraint = rng.normal(size=(2, 4)), rng.normal(size=(2, 4, 3))
+        multiplier = rng.random(3)
+        expected = [
+            [
+                (objective[i, j] - sum(constraint[i, j] * multiplier)) / (1 + sum(multiplier))
+                for j in range(4)
+            ]
+            for i in range(2)
+        ]
+        actual = lagrangian(*map(torch.tensor, (objective, constraint, multiplier)))
+        np.testing.assert_allclose(actual, expected)
+
     def test_no_gradient_reaches_the_multiplier(self):
         multiplier = LagrangeMultiplier()
         x = torch.ones(1, requires_grad=True)

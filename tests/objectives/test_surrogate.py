@@ -177,6 +177,25 @@ def test_a_bandits_cvar_is_followed_exactly(risk_level):
     torch.testing.assert_close(constraint, gaussian_cvar(mean, std, risk_level) - 0.7)
 
 
+@pytest.mark.parametrize("risk_level", [1.0, 0.25])
+def test_advantage_has_the_gradient_of_the_cvar(risk_level):
+    """That of the bandit is known: its moments are sums over contexts and actions."""
+    loss, data, cost, (states, actions) = bandit(risk_level)
+    moments = loss.measure(data)
+    advantage = loss.advantage(loss.compute_advantage(data), moments)
+    policy = torch.tensor([[0.25, 0.75], [0.5, 0.5]], dtype=torch.float64)
+    logits = policy.log().requires_grad_()
+    new = logits.softmax(1)
+    mean = (new * cost).sum(1).mean()
+    std = ((new * cost.square()).sum(1).mean() - mean.square()).sqrt()
+    exact = gaussian_cvar(mean, std, risk_level)
+    torch.testing.assert_close(loss.level(moments), exact.detach())
+    (expected,) = torch.autograd.grad(exact, logits)
+    ratio = logits.softmax(1)[states, actions] / policy[states, actions]
+    (actual,) = torch.autograd.grad((ratio * advantage.squeeze(-1)).mean(), logits)
+    torch.testing.assert_close(actual, expected)
+
+
 class CostChain(MDP):
     """Costs in place of rewards; six states, few successors each, and the moments of their sum."""
 

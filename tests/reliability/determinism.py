@@ -86,10 +86,7 @@ CASES: dict[str, Callable[[Path], None]] = {
     "safetac": lambda folder: tiny.launch(folder, *SAFETAC),
     "safetac lagrangian": lambda folder: tiny.launch(folder, "update=lagrangian", *SAFETAC),
     "safetac pid": lambda folder: tiny.launch(folder, "update=pid", *SAFETAC),
-    **{
-        name: partial(baseline, name)
-        for name in ("tac", "wcsac", "sac_lagrangian", "cpo", "trc", "offpolicy_trc")
-    },
+    **{name: partial(baseline, name) for name in methods.CASES if not name.startswith("safetac")},
     "doggo_controller": doggo.launch,
     "retrace_sac": run_retrace_sac,
     "compose_tsallis": partial(keep_episodes, partial(compose_tsallis.train, entropic_index=1.4)),

@@ -540,6 +540,15 @@ bad(
     state=weights(surrogate),
 )
 bad(
+    "CVaRSurrogateLoss.level: measured",
+    lambda: surrogate().level(torch.tensor(3.0)),
+    TypeError,
+    "measured",
+    "Tensor",
+    "what measure(...) returned",
+    state=weights(surrogate),
+)
+bad(
     "ReturnSurrogateLoss.objective: no advantage",
     lambda: return_surrogate().objective(data(), zeros(2, 4)),
     KeyError,
@@ -1591,6 +1600,7 @@ IMPOSSIBLE = {
     "pid.kp": (-1.0, "[0, inf)"),
     "pid.ki": (0.0, "(0, inf)"),
     "pid.kd": (-1.0, "[0, inf)"),
+    "optim.policy_lr": (0.0, "(0, inf)"),
     "optim.num_epochs": (0, "at least 1"),
     "optim.num_updates": (0, "at least 1"),
     "optim.tau": (1.5, "(0, 1]"),

@@ -195,6 +195,8 @@ class TestMethods:
             ("tac", GRADIENT),
             ("wcsac", GRADIENT),
             ("trc", SURROGATE),
+            ("ppo_lagrangian", SURROGATE),
+            ("trpo_pid", SURROGATE),
             ("offpolicy_trc", f"{SURROGATE} {REPLAY}"),
             ("safetac", f"{SURROGATE} {REPLAY} update=pid"),
         ],

@@ -28,8 +28,13 @@ OF_METHOD = {
     "tac": GRADIENT,
     "wcsac": GRADIENT,
     "sac_lagrangian": GRADIENT,
+    "sac_pid": GRADIENT,
     "trc": SURROGATE,
     "cpo": SURROGATE,
+    "ppo_lagrangian": SURROGATE,
+    "ppo_pid": SURROGATE,
+    "trpo_lagrangian": SURROGATE,
+    "trpo_pid": SURROGATE,
     "offpolicy_trc": [*SURROGATE, *REPLAY],
 }
 

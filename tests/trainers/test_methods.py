@@ -37,8 +37,13 @@ CASES = {
     "tac": ("tac", GRADIENT, {"update/loss_qvalue", "update/alpha"}),
     "wcsac": ("wcsac", GRADIENT, {"update/loss_cost_std", "update/multiplier"}),
     "sac_lagrangian": ("sac_lagrangian", GRADIENT, {"update/loss_actor", "update/multiplier"}),
+    "sac_pid": ("sac_pid", GRADIENT, {"update/loss_actor", "update/multiplier"}),
     "cpo": ("cpo", SURROGATE, {"update/kl", "update/loss_cost_value"}),
     "trc": ("trc", SURROGATE, {"update/kl", "update/loss_cost_variance"}),
+    **{
+        name: (name, SURROGATE, {"update/kl", "update/loss_value", "update/multiplier"})
+        for name in ("ppo_lagrangian", "ppo_pid", "trpo_lagrangian", "trpo_pid")
+    },
     "offpolicy_trc": ("offpolicy_trc", [*SURROGATE, *REPLAY], {"update/kl", "update/loss_value"}),
     "safetac_lagrangian": (
         "safetac",

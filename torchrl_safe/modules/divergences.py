@@ -182,8 +182,8 @@ class Distance(NamedTuple):
     Attributes:
         statistics (callable): from the distribution of a policy on ``[*B]`` states to tensors by
             name.
-        kl (callable): from old and new statistics to the mean divergence over states, a scalar in
-            nats, zero with zero gradient where they are the same.
+        divergence (callable): from old and new statistics to the divergence in each state, ``[*B]``
+            in nats, zero with zero gradient where they are the same.
 
     Examples:
         >>> import torch
@@ -196,7 +196,11 @@ class Distance(NamedTuple):
     """
 
     statistics: Callable[[Any], dict[str, Tensor]]
-    kl: Callable[[Statistics, Statistics], Tensor]
+    divergence: Callable[[Statistics, Statistics], Tensor]
+
+    def kl(self, old: Statistics, new: Statistics) -> Tensor:
+        """The mean divergence over states, a scalar in nats."""
+        return self.divergence(old, new).mean()
 
 
 def _moments(dist: TanhGaussianMixture) -> dict[str, Tensor]:
@@ -205,7 +209,7 @@ def _moments(dist: TanhGaussianMixture) -> dict[str, Tensor]:
 
 
 def _moment_kl(old: Statistics, new: Statistics) -> Tensor:
-    return moment_matched_kl(old["mean"], old["cov"], new["mean"], new["cov"]).mean()
+    return moment_matched_kl(old["mean"], old["cov"], new["mean"], new["cov"])
 
 
 def _mixture(dist: TanhGaussianMixture) -> dict[str, Tensor]:
@@ -214,7 +218,7 @@ def _mixture(dist: TanhGaussianMixture) -> dict[str, Tensor]:
 
 def _mixture_kl(old: Statistics, new: Statistics) -> Tensor:
     names = ("logits", "loc", "scale")
-    return matched_bound_kl(*(old[name] for name in names), *(new[name] for name in names)).mean()
+    return matched_bound_kl(*(old[name] for name in names), *(new[name] for name in names))
 
 
 def _logits(dist: Categorical) -> dict[str, Tensor]:
@@ -222,7 +226,7 @@ def _logits(dist: Categorical) -> dict[str, Tensor]:
 
 
 def _logits_kl(old: Statistics, new: Statistics) -> Tensor:
-    return categorical_kl(old["logits"], new["logits"]).mean()
+    return categorical_kl(old["logits"], new["logits"])
 
 
 MOMENT_MATCHED = Distance(_moments, _moment_kl)

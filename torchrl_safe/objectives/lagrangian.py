@@ -28,13 +28,16 @@ def lagrangian(objective: Tensor, constraint: Tensor, multiplier: Tensor) -> Ten
     of those of objective and constraints, from growing with the multipliers (Stooke et al. 2020,
     https://arxiv.org/abs/2007.03964, section 6).
 
+    Advantages are combined alike: that of ``L``, which PPO-Lagrangian and its kin follow, is the
+    Lagrangian of those of return and costs, ``[*B]`` and ``[*B, m]``.
+
     Args:
-        objective (Tensor): ``f``, to be maximised, a scalar.
-        constraint (Tensor): ``c``, feasible at or below 0, ``[m]``.
+        objective (Tensor): ``f``, to be maximised, ``[*B]``; a scalar in most cases.
+        constraint (Tensor): ``c``, feasible at or below 0, ``[*B, m]``.
         multiplier (Tensor): ``lambda >= 0``, ``[m]``. No gradient flows to it.
 
     Returns:
-        The Lagrangian, a scalar, to be maximised.
+        The Lagrangian, to be maximised, ``[*B]``.
 
     Raises:
         ValueError: if shapes disagree, a multiplier is negative, or one or a constraint is not
@@ -46,9 +49,9 @@ def lagrangian(objective: Tensor, constraint: Tensor, multiplier: Tensor) -> Ten
         >>> lagrangian(torch.tensor(4.0), torch.tensor([1.0]), torch.tensor([3.0]))
         tensor(0.2500)
     """
-    if objective.shape != () or constraint.ndim != 1 or constraint.shape != multiplier.shape:
+    if multiplier.ndim != 1 or constraint.shape != (*objective.shape, *multiplier.shape):
         raise ValueError(
-            "objective, constraint and multiplier must have shapes [], [m] and [m], got "
+            "objective, constraint and multiplier must have shapes [*B], [*B, m] and [m], got "
             f"{tuple(objective.shape)}, {tuple(constraint.shape)} and {tuple(multiplier.shape)}."
         )
     multiplier = multiplier.detach()
@@ -58,7 +61,7 @@ def lagrangian(objective: Tensor, constraint: Tensor, multiplier: Tensor) -> Ten
                 f"multiplier must be finite and at least 0, got {multiplier.tolist()}."
             )
         _check_finite(constraint)
-    return (objective - (multiplier * constraint).sum()) / (1 + multiplier.sum())
+    return (objective - (multiplier * constraint).sum(-1)) / (1 + multiplier.sum())
 
 
 class LagrangeMultiplier(nn.Module):

@@ -17,7 +17,12 @@ from torchrl.objectives.value import ValueEstimatorBase
 
 from torchrl_safe._checks import check_shape
 from torchrl_safe.objectives.common import CostLoss, Steps, TrajectoryLoss, spread
-from torchrl_safe.objectives.functional import check_regression, gaussian_cvar, surrogate_change
+from torchrl_safe.objectives.functional import (
+    check_regression,
+    cvar_factor,
+    gaussian_cvar,
+    surrogate_change,
+)
 from torchrl_safe.objectives.value import (
     RetraceEstimator,
     retrace_variance_reward,
@@ -635,6 +640,56 @@ class CVaRSurrogateLoss(CostLoss, _SurrogateLoss):
         variance = self._mean(variance + between, tensordict)
         return CostMoments(mean, variance, horizon, square_horizon)
 
+    def level(self, measured: CostMoments) -> Tensor:
+        """The CVaR of the policy that was measured, a scalar in units of the discounted cost sum.
+
+        Args:
+            measured (CostMoments): what :meth:`measure` returned.
+        """
+        _check_moments(measured)
+        return gaussian_cvar(measured.mean, _root(measured.variance), self.risk_level)
+
+    def advantage(self, tensordict: TensorDictBase, measured: CostMoments) -> Tensor:
+        r"""Advantage of the CVaR, for methods that put it beside that of the return.
+
+        .. math::
+
+            A_\Gamma = A_C + \frac{\phi(\Phi^{-1}(\alpha))}{\alpha}
+                \frac{1 - \gamma}{1 - \gamma^2} \frac{A_S - 2 J_C A_C}{2 \sqrt{\operatorname{Var}}}
+
+        The gradient of :meth:`constraint`, at the policy that was measured, is ``horizon`` times
+        that of the mean of ratios times this.
+
+        Args:
+            tensordict (TensorDictBase): what :meth:`compute_advantage` returned, or some of it,
+                ``[*B]``.
+            measured (CostMoments): what :meth:`measure` returned for the policy that the advantages
+                belong to.
+
+        Returns:
+            Advantages in units of the discounted cost sum, ``[*B]``.
+
+        Raises:
+            KeyError: if there are no advantages in the data.
+            TypeError: if ``measured`` is something else.
+        """
+        _check_moments(measured)
+        advantage = self._computed(tensordict, self.tensor_keys.cost_advantage).squeeze(-1)
+        if self.risk_level == 1 or measured.variance <= _LEAST_VARIANCE:
+            return advantage
+        slope = cvar_factor(self.risk_level) / (2 * measured.variance.sqrt())
+        slope = slope * measured.square_horizon / measured.horizon
+        return advantage + slope * self._square_deviation(tensordict)
+
+    def _square_deviation(self, tensordict: TensorDictBase) -> Tensor:
+        """Advantage of the squared deviation from the mean, [*B]."""
+        keys = self.tensor_keys
+        mean, advantage, square = (
+            self._computed(tensordict, key).squeeze(-1)
+            for key in (keys.cost_value, keys.cost_advantage, keys.square_advantage)
+        )
+        return square - 2 * self._mean(mean, tensordict) * advantage
+
     def constraint(
         self,
         tensordict: TensorDictBase,
@@ -664,22 +719,29 @@ class CVaRSurrogateLoss(CostLoss, _SurrogateLoss):
             TypeError: if ``measured`` is something else.
             ValueError: if ``cost_limit`` is negative or not finite.
         """
-        if not isinstance(measured, CostMoments):
-            raise TypeError(
-                f"measured must be what measure(...) returned, got {type(measured).__name__}."
-            )
+        _check_moments(measured)
         limit = self._limit(cost_limit)
-        keys = self.tensor_keys
-        advantage = self._computed(tensordict, keys.cost_advantage)
+        advantage = self._computed(tensordict, self.tensor_keys.cost_advantage)
         change = self._change(tensordict, log_prob, advantage, 0.0)  # of the mean cost per step
         mean = measured.mean + measured.horizon * change
         if self.risk_level == 1:
             return mean - limit
-        center = self._computed(tensordict, keys.cost_value)
-        center = self._mean(center.squeeze(-1), tensordict)
-        deviation = self._computed(tensordict, keys.square_advantage) - 2 * center * advantage
+        deviation = self._square_deviation(tensordict).unsqueeze(-1)
         deviation = self._change(tensordict, log_prob, deviation, 0.0) - change.square()
         variance = measured.variance + measured.square_horizon * deviation
-        # The root has no slope at 0; a variance this small has no part in a CVaR.
-        std = variance.clamp(min=1e-8).sqrt()
-        return gaussian_cvar(mean, std, self.risk_level) - limit
+        return gaussian_cvar(mean, _root(variance), self.risk_level) - limit
+
+
+# The root has no slope at 0; a variance this small has no part in a CVaR.
+_LEAST_VARIANCE = 1e-8
+
+
+def _root(variance: Tensor) -> Tensor:
+    return variance.clamp(min=_LEAST_VARIANCE).sqrt()
+
+
+def _check_moments(measured: CostMoments) -> None:
+    if not isinstance(measured, CostMoments):
+        raise TypeError(
+            f"measured must be what measure(...) returned, got {type(measured).__name__}."
+        )

@@ -8,23 +8,30 @@ need("training", "train", "hydra", "imageio", "matplotlib", "pydantic", "tqdm")
 
 from torchrl_safe.trainers.methods import METHODS
 from torchrl_safe.trainers.offpolicy_trc import OffPolicyTRC
+from torchrl_safe.trainers.ppo_lagrangian import PPOPID, PPOLagrangian
 from torchrl_safe.trainers.safetac import SafeTAC
 from torchrl_safe.trainers.saved_policies import load_policy
 from torchrl_safe.trainers.tac import TAC
 from torchrl_safe.trainers.trainer import ConstrainedTrainer, Trainer
 from torchrl_safe.trainers.trc import CPO, TRC
-from torchrl_safe.trainers.wcsac import WCSAC, SACLagrangian
+from torchrl_safe.trainers.trpo_lagrangian import TRPOPID, TRPOLagrangian
+from torchrl_safe.trainers.wcsac import SACPID, WCSAC, SACLagrangian
 
 __all__ = [
     "CPO",
     "METHODS",
+    "PPOPID",
+    "SACPID",
     "TAC",
     "TRC",
+    "TRPOPID",
     "WCSAC",
     "ConstrainedTrainer",
     "OffPolicyTRC",
+    "PPOLagrangian",
     "SACLagrangian",
     "SafeTAC",
+    "TRPOLagrangian",
     "Trainer",
     "load_policy",
 ]

@@ -10,7 +10,7 @@ from torchrl._utils import timeit
 from torchrl.envs import EnvBase
 
 from torchrl_safe.trainers.off_policy import make_slice_buffer, replayed
-from torchrl_safe.trainers.on_policy import SurrogateOptim, SurrogateOptions, SurrogateTrainer
+from torchrl_safe.trainers.on_policy import SurrogateOptim, SurrogateOptions, TrustRegionTrainer
 from torchrl_safe.trainers.options import SliceBuffer, again, option
 
 
@@ -38,7 +38,7 @@ class OffPolicyTRCOptions(SurrogateOptions):
     optim: OffPolicyTRCOptim = Field(default_factory=OffPolicyTRCOptim)
 
 
-class OffPolicyTRC(SurrogateTrainer):
+class OffPolicyTRC(TrustRegionTrainer):
     """TRC on old and new trajectories; how high the cost stands is measured on the new.
 
     Examples:

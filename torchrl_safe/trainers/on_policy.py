@@ -1,4 +1,8 @@
-"""What CPO, TRC and off-policy TRC share: surrogates, their critics and the policy's step."""
+"""What methods on surrogates share: critics, advantages, and two ways to move the policy by them.
+
+A surrogate says what a change of the policy does to return and costs, out of ratios of densities
+and advantages. It needs no gradient of an action.
+"""
 
 from __future__ import annotations
 
@@ -8,7 +12,8 @@ from typing import Any, ClassVar
 import torch
 from pydantic import Field
 from tensordict import TensorDict, TensorDictBase
-from torch import nn
+from torch import Tensor, nn
+from torchrl._utils import timeit
 from torchrl.envs import EnvBase
 
 from torchrl_safe.modules import DISTANCES
@@ -17,7 +22,10 @@ from torchrl_safe.optim import FiniteSteps
 from torchrl_safe.trainers.networks import is_discrete
 from torchrl_safe.trainers.off_policy import as_components, minibatches
 from torchrl_safe.trainers.options import (
+    Collector,
     ConstrainedLoss,
+    Group,
+    KLRegion,
     MethodOptions,
     TrustRegion,
     again,
@@ -25,6 +33,17 @@ from torchrl_safe.trainers.options import (
 )
 from torchrl_safe.trainers.policy_steps import make_trust_region
 from torchrl_safe.trainers.trainer import ConstrainedTrainer
+
+
+class OnPolicyCollector(Collector):
+    """Who acts, and for how long."""
+
+    frames_per_batch: int = again(
+        Collector,
+        "frames_per_batch",
+        20_000,
+        meaning="frames per update: a step fits the noise of fewer",
+    )
 
 
 class SurrogateLoss(ConstrainedLoss):
@@ -39,8 +58,14 @@ class SurrogateLoss(ConstrainedLoss):
     )
 
 
-class SurrogateOptim(TrustRegion):
-    """Critics and the trust-region step."""
+class MeanSurrogateLoss(SurrogateLoss):
+    """Reward and the limit."""
+
+    risk_level: float = again(SurrogateLoss, "risk_level", 1.0, meaning="1 is the expectation")
+
+
+class SurrogateCritics(Group):
+    """The critics' gradient steps."""
 
     critic_lr: float = option(1e-3, "of Adam", gt=0)
     max_grad_norm: float = option(1.0, "of the critics together", gt=0)
@@ -49,25 +74,69 @@ class SurrogateOptim(TrustRegion):
     )
     critic_rounds: int = option(8, "passes over the data per update, each with new targets", ge=1)
     minibatch_size: int = option(512, "steps per gradient step of the critics", ge=1)
-    damping: float = again(TrustRegion, "damping", 0.1)
+
+
+class KLOptim(KLRegion, SurrogateCritics):
+    """Critics and a trust-region step without constraints."""
+
+    damping: float = again(KLRegion, "damping", 0.1)
+
+
+class SurrogateOptim(TrustRegion, KLOptim):
+    """Critics and the trust-region step."""
+
     recovery_ratio: float = again(TrustRegion, "recovery_ratio", 1.0)
 
 
+class GradientOptim(SurrogateCritics):
+    """Gradient steps of critics and policy."""
+
+    max_grad_norm: float = again(
+        SurrogateCritics, "max_grad_norm", 1.0, meaning="of the critics together, and of the policy"
+    )
+    max_skipped: int = again(
+        SurrogateCritics,
+        "max_skipped",
+        100,
+        meaning="gradient steps per round or update skipped as not finite, before the run stops",
+    )
+    minibatch_size: int = again(
+        SurrogateCritics, "minibatch_size", 512, meaning="steps per gradient step"
+    )
+    policy_lr: float = option(3e-4, "of Adam, of the policy", gt=0)
+    num_epochs: int = option(10, "passes of the policy over the batch, at most", ge=1)
+    max_kl: float = option(
+        0.02, "the policy makes no further pass once it has moved by this, nats", gt=0
+    )
+
+
 class SurrogateOptions(MethodOptions):
-    """What the options of these methods have."""
+    """The options of methods with a trust region on surrogates."""
 
     loss: SurrogateLoss = Field(default_factory=SurrogateLoss)
     optim: SurrogateOptim = Field(default_factory=SurrogateOptim)
 
 
-class SurrogateTrainer(ConstrainedTrainer):
-    """A trust region on surrogates of return and costs, which need no gradient of an action."""
+class OnPolicyOptions(MethodOptions):
+    """What the options of on-policy methods have that limit the mean of a cost."""
 
-    Options: ClassVar[type[MethodOptions]] = SurrogateOptions
+    collector: OnPolicyCollector = Field(default_factory=OnPolicyCollector)
+    loss: MeanSurrogateLoss = Field(default_factory=MeanSurrogateLoss)
+
+
+class GradientOptions(OnPolicyOptions):
+    """The options of on-policy methods of gradient steps."""
+
+    optim: GradientOptim = Field(default_factory=GradientOptim)
+
+
+class SurrogateTrainer(ConstrainedTrainer):
+    """A method on surrogates: its policy, its critics and how they learn."""
+
     discrete = True
 
     def build(self, env: EnvBase) -> dict[str, Any]:
-        """A policy, surrogates with critics of states, and the trust region."""
+        """A policy, and surrogates with critics of states."""
         options = self.options
         self.policy = self.make_policy(env)
         self.reward_loss = ReturnSurrogateLoss(
@@ -88,16 +157,11 @@ class SurrogateTrainer(ConstrainedTrainer):
             max_grad_norm=options.optim.max_grad_norm,
             max_skipped=options.optim.max_skipped,
         )
-        kind = "categorical" if is_discrete(env) else "moment_matched"
-        self.distance = DISTANCES[kind]
-        self.trust_region = make_trust_region(
-            options.optim, self.policy, self.distance, options.device
-        )
+        self.distance = DISTANCES["categorical" if is_discrete(env) else "moment_matched"]
         return {
             "reward_loss": self.reward_loss,
             **as_components(self, "cost_loss", self.cost_losses),
             "critic_optim": critic_optim,
-            "policy_optim": self.trust_region,
         }
 
     def _cost_loss(self, env: EnvBase, cost: str) -> CVaRSurrogateLoss:
@@ -118,6 +182,24 @@ class SurrogateTrainer(ConstrainedTrainer):
         )
         surrogate.set_keys(cost=cost, **keys)
         return surrogate
+
+    def update(self, batch: TensorDictBase) -> dict[str, float]:
+        """Critics on the new batch, then the policy on it; then it is thrown away."""
+        with timeit("time/critics"):
+            for _ in range(self.options.optim.critic_rounds):
+                losses = self.fit_critics(self.with_advantages(batch))
+        with timeit("time/policy"):
+            step = self.policy_step(self.with_advantages(batch), batch)
+        skipped = losses.pop("update/skipped_steps") + step.pop("update/skipped_steps", 0.0)
+        return {**losses, **step, "update/skipped_steps": skipped}
+
+    def policy_step(self, data: TensorDictBase, batch: TensorDictBase) -> dict[str, float]:
+        """Move the policy by steps with advantages; how high costs stand ``batch`` says.
+
+        Returns:
+            dict: metrics to log.
+        """
+        raise NotImplementedError
 
     def with_advantages(
         self, trajectories: TensorDictBase, *, rescored: bool = False
@@ -148,16 +230,38 @@ class SurrogateTrainer(ConstrainedTrainer):
         metrics = {f"update/{name}": value.item() for name, value in losses.items()}
         return metrics | {"update/skipped_steps": float(self.critic_steps.count())}
 
+    def measure(self, batch: TensorDictBase) -> dict[str, CostMoments]:
+        """Where each cost of the policy stands that took the steps of a batch."""
+        return {cost: loss.measure(batch) for cost, loss in self.cost_losses.items()}
+
+    def measured_levels(self, measured: Mapping[str, CostMoments]) -> dict[str, Tensor]:
+        """What is limited, as it was measured: discounted sums, by cost."""
+        return {cost: loss.level(measured[cost]) for cost, loss in self.cost_losses.items()}
+
+    def deviations(self, measured: Mapping[str, CostMoments]) -> dict[str, float]:
+        """Metrics of the deviations of costs."""
+        deviations = {cost: each.variance.sqrt().item() for cost, each in measured.items()}
+        return self.named("update/measured_cost_std", deviations)
+
+
+class TrustRegionTrainer(SurrogateTrainer):
+    """A trust region on surrogates of return and costs."""
+
+    Options: ClassVar[type[MethodOptions]] = SurrogateOptions
+
+    def build(self, env: EnvBase) -> dict[str, Any]:
+        """A policy, surrogates with critics of states, and the trust region."""
+        components = super().build(env)
+        self.trust_region = make_trust_region(
+            self.options.optim, self.policy, self.distance, self.options.device
+        )
+        return {**components, "policy_optim": self.trust_region}
+
     def policy_step(self, data: TensorDictBase, batch: TensorDictBase) -> dict[str, float]:
         """A trust-region step on ``data``; how high costs stand is measured on ``batch``."""
-        limits = self.limits()
-        measured = {cost: loss.measure(batch) for cost, loss in self.cost_losses.items()}
+        limits, measured = self.limits(), self.measure(batch)
         report = self.trust_region.step(self.closure(data, limits, measured))
-        deviations = {cost: each.variance.sqrt().item() for cost, each in measured.items()}
-        return {
-            **self.report(report, limits),
-            **self.named("update/measured_cost_std", deviations),
-        }
+        return {**self.report(report, limits), **self.deviations(measured)}
 
     def closure(
         self,
@@ -183,3 +287,73 @@ class SurrogateTrainer(ConstrainedTrainer):
             )
 
         return closure
+
+
+class GradientTrainer(SurrogateTrainer):
+    """Gradient steps on minibatches of a batch, in passes that the policy's movement ends."""
+
+    Options: ClassVar[type[MethodOptions]] = GradientOptions
+
+    def build(self, env: EnvBase) -> dict[str, Any]:
+        """A policy, surrogates with critics of states, and the policy's optimizer."""
+        components, optim = super().build(env), self.options.optim
+        adam = torch.optim.Adam(self.policy.parameters(), lr=optim.policy_lr, fused=True)
+        self.policy_steps = FiniteSteps(
+            adam, max_grad_norm=optim.max_grad_norm, max_skipped=optim.max_skipped
+        )
+        return {**components, "policy_optim": adam}
+
+    def advantages(
+        self, data: TensorDictBase, measured: Mapping[str, CostMoments]
+    ) -> tuple[Tensor, Tensor]:
+        """Advantages of the return, ``[*B]``, and of the limited risks of the costs, ``[*B, m]``.
+
+        They are centred, and in one unit: a change of the policy that is kept moves each sum by the
+        horizon of the return times the mean of ratios times these.
+
+        Args:
+            data (TensorDictBase): what :meth:`with_advantages` returned.
+            measured (mapping): what :meth:`measure` returned for the policy that acted.
+        """
+        to_return = 1 - self.options.loss.gamma  # one over its horizon
+        costs = [
+            to_return * measured[cost].horizon * loss.advantage(data, measured[cost])
+            for cost, loss in self.cost_losses.items()
+        ]
+        reward, cost = data["advantage"].squeeze(-1), torch.stack(costs, -1)
+        return reward - reward.mean(), cost - cost.mean(0)
+
+    def descend(
+        self,
+        data: TensorDictBase,
+        losses_of: Callable[[TensorDictBase], TensorDictBase | Mapping[str, Tensor]],
+    ) -> dict[str, float]:
+        """Passes over steps, until the policy has moved by ``optim.max_kl``.
+
+        Args:
+            data (TensorDictBase): what ``losses_of`` reads, flat.
+            losses_of (callable): from a minibatch to losses ``loss_*`` of the policy. A minibatch
+                also holds ``"old"``, the statistics of the policy before the first pass.
+
+        Returns:
+            dict: metrics, losses those of the last minibatch.
+        """
+        optim = self.options.optim
+        with torch.no_grad():
+            old = self.distance.statistics(self.policy.get_dist(data))
+            data = data.copy().set("old", TensorDict(old, data.batch_size))
+        epochs, kl = 0, 0.0
+        while epochs < optim.num_epochs and kl <= optim.max_kl:
+            epochs += 1
+            for minibatch in minibatches(data, optim.minibatch_size):
+                losses = losses_of(minibatch)
+                self.policy_steps.step(losses)
+            with torch.no_grad():
+                new = self.distance.statistics(self.policy.get_dist(data))
+                kl = self.distance.kl(old, new).item()
+        return {
+            **{f"update/{n}": x.item() for n, x in losses.items() if n.startswith("loss_")},
+            "update/kl": kl,
+            "update/epochs": float(epochs),
+            "update/skipped_steps": float(self.policy_steps.count()),
+        }

@@ -272,8 +272,8 @@ class ConstrainedLoss(Loss):
         return value
 
 
-class TrustRegion(Group):
-    """The trust-region step."""
+class KLRegion(Group):
+    """A trust-region step without constraints."""
 
     max_kl: float = option(0.02, "size of the trust region, nats", gt=0)
     damping: float = option(0.01, "added to the diagonal of the curvature", ge=0)
@@ -282,16 +282,26 @@ class TrustRegion(Group):
         0.8, "of one line-search candidate to the one before", gt=0, lt=1
     )
     max_backtracks: int = option(10, "candidates after the first", ge=0)
-    recovery_ratio: float = option(
-        0.7, "share of the trust region's radius that a violated constraint may claim", gt=0, le=1
-    )
     cuda_graphs: bool = option(True, "on a GPU: launch work at once, not kernel by kernel")
 
 
-class Lagrangian(Group):
-    """A multiplier that learns by gradient."""
+class TrustRegion(KLRegion):
+    """The trust-region step."""
+
+    recovery_ratio: float = option(
+        0.7, "share of the trust region's radius that a violated constraint may claim", gt=0, le=1
+    )
+
+
+class InitialPrice(Group):
+    """What a multiplier starts with."""
 
     init: float = option(0.1, "multiplier to start with", gt=0, fixed=True)
+
+
+class Lagrangian(InitialPrice):
+    """A multiplier that learns by gradient."""
+
     lr: float = option(0.005, "of the multiplier, which moves by at most this once per batch", gt=0)
 
 

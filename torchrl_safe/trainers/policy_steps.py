@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import torch
@@ -13,7 +13,23 @@ from torchrl_safe import TrustRegionSafeOptimizer
 from torchrl_safe.modules import Distance
 from torchrl_safe.objectives import LagrangeMultiplier, PIDMultiplier, lagrangian
 from torchrl_safe.optim import FiniteSteps
-from torchrl_safe.trainers.options import Group, Lagrangian, TrustRegion, option, settings_of
+from torchrl_safe.trainers.options import (
+    Group,
+    InitialPrice,
+    KLRegion,
+    Lagrangian,
+    TrustRegion,
+    again,
+    option,
+    settings_of,
+)
+from torchrl_safe.trainers.trainer import ConstrainedTrainer
+
+
+class QuickLagrangian(Lagrangian):
+    """A multiplier that learns by gradient, from the cost of one batch after another."""
+
+    lr: float = again(Lagrangian, "lr", 0.035)
 
 
 class PID(Group):
@@ -25,7 +41,7 @@ class PID(Group):
 
 
 def make_trust_region(
-    options: TrustRegion, policy: nn.Module, distance: Distance, device: str
+    options: KLRegion, policy: nn.Module, distance: Distance, device: str
 ) -> TrustRegionSafeOptimizer:
     """The optimizer of the policy, with the options' numbers."""
     return TrustRegionSafeOptimizer(
@@ -35,7 +51,7 @@ def make_trust_region(
         cg_iters=options.cg_iters,
         backtrack_ratio=options.backtrack_ratio,
         max_backtracks=options.max_backtracks,
-        recovery_ratio=options.recovery_ratio,
+        recovery_ratio=options.recovery_ratio if isinstance(options, TrustRegion) else 1.0,
         statistics_kl=distance.kl,
         cuda_graph=options.cuda_graphs and torch.device(device).type == "cuda",
     )
@@ -46,13 +62,14 @@ class Multiplier:
 
     Args:
         num_constraints (int): m.
-        lagrangian (Lagrangian): what they start with, and how fast they learn.
+        lagrangian (InitialPrice): what they start with; a :class:`Lagrangian` says how fast they
+            learn.
         pid (PID, optional): the gains of a controller that sets them in place of learning.
         device (str): where they are.
     """
 
     def __init__(
-        self, num_constraints: int, lagrangian: Lagrangian, pid: PID | None, device: str
+        self, num_constraints: int, lagrangian: InitialPrice, pid: PID | None, device: str
     ) -> None:
         self.module: LagrangeMultiplier | PIDMultiplier
         self.optim: Any = None  # of one that learns
@@ -60,7 +77,7 @@ class Multiplier:
             self.module = PIDMultiplier(
                 num_constraints, kp=pid.kp, ki=pid.ki, kd=pid.kd, init=lagrangian.init
             ).to(device)
-        else:
+        elif isinstance(lagrangian, Lagrangian):
             self.module = LagrangeMultiplier(num_constraints, init=lagrangian.init).to(device)
             # With equal betas no step exceeds the rate, and a quiet time is soon forgotten.
             self.optim = torch.optim.Adam(
@@ -70,6 +87,21 @@ class Multiplier:
     def __call__(self) -> Tensor:
         """The multipliers, ``[m]``."""
         return self.module()
+
+    def react(self, trainer: ConstrainedTrainer, levels: Mapping[str, Tensor]) -> dict[str, float]:
+        """React to how high costs stand, against the limits of now.
+
+        Args:
+            trainer (ConstrainedTrainer): whose limits they are.
+            levels (mapping): discounted sums, by cost.
+
+        Returns:
+            dict: metrics, of the multipliers after it.
+        """
+        limits = trainer.limits()
+        self.update(torch.stack([levels[cost] - limit for cost, limit in limits.items()]))
+        prices = dict(zip(limits, self().tolist(), strict=True))
+        return {**trainer.named("update/multiplier", prices), **trainer.levels(levels)}
 
     def update(self, constraint: Tensor) -> None:
         """React to the measured constraints, ``[m]``."""
@@ -92,6 +124,13 @@ class Multiplier:
             put_back = settings_of(self.optim)
             self.optim.load_state_dict(state["optim"])
             put_back()
+
+
+def make_multiplier(trainer: ConstrainedTrainer) -> Multiplier:
+    """A multiplier for each cost, of the groups ``lagrangian`` and, if there is one, ``pid``."""
+    options = trainer.options
+    pid = getattr(options, "pid", None)
+    return Multiplier(len(trainer.costs), options.lagrangian, pid, options.device)
 
 
 def ascend(

@@ -225,14 +225,13 @@ class SafeTAC(ConstrainedTrainer):
         """The multipliers' step, then gradient steps up the Lagrangian."""
         limits = self.limits()
         levels = {name: loss.on_policy_cvar(batch) for name, loss in self.cost_losses.items()}
-        self.multiplier.update(torch.stack([levels[name] - limits[name] for name in limits]))
+        priced = self.multiplier.react(self, levels)
         visited = batch.select(*self.in_keys).flatten()
         for states in minibatches(visited, self.options.lagrangian.minibatch_size):
             closure = self.policy_closure(states, limits)
             metrics |= ascend(self.policy_steps, closure, self.multiplier())
         metrics["update/skipped_steps"] += self.policy_steps.count()
-        prices = dict(zip(limits, self.multiplier().tolist(), strict=True))
-        return {**metrics, **self.named("update/multiplier", prices), **self.levels(levels)}
+        return {**metrics, **priced}
 
     def policy_closure(
         self,

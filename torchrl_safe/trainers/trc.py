@@ -5,22 +5,14 @@ from __future__ import annotations
 from typing import ClassVar
 
 from pydantic import Field
-from tensordict import TensorDictBase
-from torchrl._utils import timeit
 
-from torchrl_safe.trainers.on_policy import SurrogateLoss, SurrogateOptions, SurrogateTrainer
-from torchrl_safe.trainers.options import Collector, MethodOptions, again
-
-
-class TRCCollector(Collector):
-    """Who acts, and for how long."""
-
-    frames_per_batch: int = again(
-        Collector,
-        "frames_per_batch",
-        20_000,
-        meaning="frames per update: a step fits the noise of fewer",
-    )
+from torchrl_safe.trainers.on_policy import (
+    MeanSurrogateLoss,
+    OnPolicyCollector,
+    SurrogateOptions,
+    TrustRegionTrainer,
+)
+from torchrl_safe.trainers.options import MethodOptions
 
 
 class TRCOptions(SurrogateOptions):
@@ -28,10 +20,10 @@ class TRCOptions(SurrogateOptions):
 
     method: ClassVar[str] = "trc"
 
-    collector: TRCCollector = Field(default_factory=TRCCollector)
+    collector: OnPolicyCollector = Field(default_factory=OnPolicyCollector)
 
 
-class TRC(SurrogateTrainer):
+class TRC(TrustRegionTrainer):
     """Trust region conditional value at risk, on-policy.
 
     Examples:
@@ -42,28 +34,13 @@ class TRC(SurrogateTrainer):
 
     Options: ClassVar[type[MethodOptions]] = TRCOptions
 
-    def update(self, batch: TensorDictBase) -> dict[str, float]:
-        """Critics on the new batch, then a trust-region step on it; then it is thrown away."""
-        with timeit("time/critics"):
-            for _ in range(self.options.optim.critic_rounds):
-                losses = self.fit_critics(self.with_advantages(batch))
-        with timeit("time/policy"):
-            step = self.policy_step(self.with_advantages(batch), batch)
-        return {**losses, **step}
-
-
-class CPOLoss(SurrogateLoss):
-    """Reward and the limit."""
-
-    risk_level: float = again(SurrogateLoss, "risk_level", 1.0, meaning="1 is the expectation")
-
 
 class CPOOptions(TRCOptions):
     """The options of CPO."""
 
     method: ClassVar[str] = "cpo"
 
-    loss: CPOLoss = Field(default_factory=CPOLoss)
+    loss: MeanSurrogateLoss = Field(default_factory=MeanSurrogateLoss)
 
 
 class CPO(TRC):

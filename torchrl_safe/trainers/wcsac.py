@@ -1,4 +1,4 @@
-"""WCSAC (Yang et al. 2021), and SAC-Lagrangian (Ha et al. 2020), which limits the mean cost."""
+"""WCSAC (Yang et al. 2021); SAC-Lagrangian (Ha et al. 2020) and SAC-PID limit the mean cost."""
 
 from __future__ import annotations
 
@@ -26,13 +26,14 @@ from torchrl_safe.trainers.off_policy import (
 )
 from torchrl_safe.trainers.options import (
     ConstrainedLoss,
+    InitialPrice,
     Lagrangian,
     MethodOptions,
     ReplayBuffer,
     again,
     option,
 )
-from torchrl_safe.trainers.policy_steps import Multiplier
+from torchrl_safe.trainers.policy_steps import PID, make_multiplier
 from torchrl_safe.trainers.trainer import ConstrainedTrainer
 
 
@@ -43,14 +44,19 @@ class WCSACLoss(ConstrainedLoss):
     alpha: float = option(0.01, "entropy weight to start with; it is tuned", gt=0, fixed=True)
 
 
-class WCSACOptions(MethodOptions):
-    """The options of WCSAC."""
-
-    method: ClassVar[str] = "wcsac"
+class SoftOptions(MethodOptions):
+    """What the options of these methods have."""
 
     replay_buffer: ReplayBuffer = Field(default_factory=ReplayBuffer)
     loss: WCSACLoss = Field(default_factory=WCSACLoss)
     optim: SoftUpdates = Field(default_factory=SoftUpdates)
+
+
+class WCSACOptions(SoftOptions):
+    """The options of WCSAC."""
+
+    method: ClassVar[str] = "wcsac"
+
     lagrangian: Lagrangian = Field(default_factory=Lagrangian)
 
 
@@ -78,7 +84,7 @@ class WCSAC(ConstrainedTrainer):
         self.targets = [SoftUpdate(loss, tau=options.optim.tau) for loss in losses]
         optim = joint_optim(losses, options.optim.lr)
         self.steps = FiniteSteps(optim, max_skipped=options.optim.max_skipped)
-        self.multiplier = Multiplier(len(self.costs), options.lagrangian, None, options.device)
+        self.multiplier = make_multiplier(self)
         self.buffer = make_buffer(self)
         return {
             "reward_loss": self.reward_loss,
@@ -95,7 +101,7 @@ class WCSAC(ConstrainedTrainer):
             return {}
         limits = self.limits()
         levels = {cost: loss.on_policy_cvar(batch) for cost, loss in self.cost_losses.items()}
-        self.multiplier.update(torch.stack([levels[cost] - limits[cost] for cost in limits]))
+        priced = self.multiplier.react(self, levels)
         with timeit("time/update"):
             for _ in range(self.options.optim.num_updates):
                 minibatch = self.buffer.sample()
@@ -104,11 +110,9 @@ class WCSAC(ConstrainedTrainer):
                 self.steps.step(losses)
                 for target in self.targets:
                     target.step()
-        prices = dict(zip(limits, self.multiplier().tolist(), strict=True))
         return {
             **{f"update/{name}": value.item() for name, value in losses.items()},
-            **self.named("update/multiplier", prices),
-            **self.levels(levels),
+            **priced,
             "update/skipped_steps": float(self.steps.count()),
             "update/alpha": self.reward_loss.log_alpha.exp().item(),
         }
@@ -153,4 +157,25 @@ class SACLagrangian(WCSAC):
         >>> policy = SACLagrangian("point").train(total_frames=1_000_000)  # doctest: +SKIP
     """
 
-    Options = SACLagrangianOptions
+    Options: ClassVar[type[MethodOptions]] = SACLagrangianOptions
+
+
+class SACPIDOptions(SoftOptions):
+    """The options of SAC-PID."""
+
+    method: ClassVar[str] = "sac_pid"
+
+    loss: SACLagrangianLoss = Field(default_factory=SACLagrangianLoss)
+    lagrangian: InitialPrice = Field(default_factory=InitialPrice)
+    pid: PID = Field(default_factory=PID)
+
+
+class SACPID(SACLagrangian):
+    """SAC-Lagrangian with a multiplier that a PID controller sets.
+
+    Examples:
+        >>> from torchrl_safe.trainers import SACPID
+        >>> policy = SACPID("point").train(total_frames=1_000_000)  # doctest: +SKIP
+    """
+
+    Options = SACPIDOptions

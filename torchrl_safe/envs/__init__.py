@@ -22,7 +22,7 @@ from torchrl_safe.envs.randomization import (
     RANDOMIZATIONS,
     Randomization,
 )
-from torchrl_safe.envs.robots import ROBOTS, Robot, get_robot
+from torchrl_safe.envs.robots import ROBOTS, Instruments, Robot, get_robot
 from torchrl_safe.envs.tasks import GoalTask, NavigationSpeedTask, NavigationTask
 from torchrl_safe.envs.tasks.velocity import VELOCITY_TASKS, VelocityTask, get_velocity_task
 from torchrl_safe.envs.transforms import CostFunction, SafeFrameSkip, cost_keys
@@ -50,6 +50,7 @@ __all__ = [
     "GymRobotVectorEnv",
     "GymVelocityEnv",
     "GymVelocityVectorEnv",
+    "Instruments",
     "NavigationSpeedTask",
     "NavigationTask",
     "Randomization",

@@ -307,7 +307,7 @@ class RobotCore(Core[RobotFrame]):
         noise = self.robot.joint_noise
         if not noise:
             return None
-        joints = len(self.robot.instruments.hinges)
+        joints = self._robots.physics()["qpos"].shape[1] - 7
         return noise * (2.0 * self._streams.uniform(rows, joints) - 1.0)
 
     def _simulate(self, action: Array) -> Mask:

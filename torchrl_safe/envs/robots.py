@@ -98,8 +98,8 @@ class Robot:
         instruments (Instruments): what it shows of itself in such a task.
         height (float): of the site ``"robot"`` where such a task starts, metres.
         lowest (float): such a task is over when the site is at this height or below it.
-        joint_noise (float): half the width of the uniform noise on the joints behind the base at
-            the start.
+        joint_noise (float): half the width of the uniform noise on the coordinates behind a free
+            base at the start.
 
     Raises:
         ValueError: if a number is out of its range.
@@ -136,6 +136,17 @@ class Robot:
             value = getattr(self, name)
             if not isinstance(value, int) or value < 1:
                 raise ValueError(f"{name} must be an integer >= 1, got {value}.")
+        limit = np.atleast_1d(np.asarray(self.action_limit, float))
+        if (
+            limit.shape not in ((1,), (self.action_dim,))
+            or not ((limit > 0) & (limit < np.inf)).all()
+        ):
+            raise ValueError(
+                f"action_limit must be one positive number or {self.action_dim} of them, "
+                f"got {self.action_limit}."
+            )
+        if not 0.0 <= self.joint_noise < np.inf:
+            raise ValueError(f"joint_noise must be at least 0 and finite, got {self.joint_noise}.")
 
     @property
     def asset_path(self) -> Path:

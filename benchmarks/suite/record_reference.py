@@ -5,7 +5,8 @@ It runs in a Python of its own (see the README of this folder), not in that of t
     python benchmarks/suite/record_reference.py tests/envs/reference
 
 Per task there are a few short episodes. In each the robot is put in front of another kind of object
-and driven at it, so that costs, contacts and reached goals are among the steps.
+and driven at it, so that costs, contacts and reached goals are among the steps. What walks is
+thrown at it.
 """
 
 import argparse
@@ -17,7 +18,13 @@ import safety_gymnasium
 
 TASKS = ("Goal0", "Goal1", "Goal2", "Circle0", "Circle1", "Circle2", "Run0")
 TASKS += ("Button0", "Button1", "Button2", "Push0", "Push1", "Push2")
-ROBOTS = ("Point", "Car")
+ROBOTS = ("Point", "Car", "Ant", "Doggo", "Racecar")
+THROWN = {"Ant": 2.0, "Doggo": 1.0}  # metres per second
+# How far from an object's centre a robot is put, metres.
+NEAR = {"gremlins": 0.26, "push_box": 0.6, "": 0.42}
+WALKERS_NEAR = {"goal": 0.35, "hazards": 0.25, "vases": 0.3, "pillars": 0.45, "push_box": 0.6}
+WALKERS_NEAR[""] = 0.35
+RACECAR_NEAR = {"pillars": 0.55, "push_box": 0.8, "": 0.45}
 STEPS = 20
 LAYOUTS = {
     "Button1": 60,
@@ -52,6 +59,7 @@ def put(task, position, yaw):
     """Puts the robot somewhere, at rest; whatever remembers where it was is told."""
     data = task.data
     data.qvel[:] = 0.0
+    data.qvel[:2] = THROWN.get(task.agent_name, 0.0) * turn(yaw)[:, 0]
     if task.agent_name == "Point":
         origin, start = base(task)
         data.qpos[:2] = turn(start).T @ (position - origin)
@@ -80,7 +88,8 @@ def state(task):
         robot = np.r_[origin + rotation @ qpos[:2], start + qpos[2]]
         speed = np.r_[rotation @ qvel[:2], qvel[2]]
     else:
-        robot, speed = qpos[:13].copy(), qvel[:11].copy()
+        size = task.agent.body_info
+        robot, speed = qpos[: size.nq].copy(), qvel[: size.nv].copy()
     out = {"robot_qpos": robot, "robot_qvel": speed, "time": np.array(data.time)}
     for kind, pattern in FREE:
         bodies = names(task, kind, pattern)
@@ -106,16 +115,36 @@ def state(task):
 
 def steer(task, rng, target):
     """Towards a target, not quite straight."""
-    ahead = np.array([1.0, 0.0] if task.agent_name == "Point" else [0.0, -1.0])
+    if task.agent_name in THROWN:
+        return rng.uniform(-1.0, 1.0, task.agent.body_info.nu)
+    ahead = np.array([0.0, -1.0] if task.agent_name == "Car" else [1.0, 0.0])
     mat, offset = task.agent.mat, np.r_[target - task.agent.pos[:2], 0.0]
     x, y = (offset @ mat)[:2]
     bearing = np.arctan2(ahead[0] * y - ahead[1] * x, ahead[0] * x + ahead[1] * y)
     bend = 2.0 * bearing
-    if task.agent_name == "Point":
-        action = np.array([0.9, bend])
-    else:
+    if task.agent_name == "Car":
         action = np.array([0.6 + bend, 0.6 - bend])
-    return np.clip(action + rng.normal(0.0, 0.15, 2), -1.0, 1.0)
+    else:
+        action = np.array([0.9, bend])
+    limit = task.action_space.high
+    return limit * np.clip(action + rng.normal(0.0, 0.15, 2), -1.0, 1.0)
+
+
+def sensitivity(task, action, aside, rng):
+    """How much the robot's sensors after a step change with the seventh digit of where it starts.
+
+    Where a wheel grazes the floor they change by as much as anybody's rounding would change them.
+    """
+    outcomes = []
+    for size in (0.0, *[1e-7] * 8):
+        for name in ("qpos", "qvel", "qacc_warmstart", "mocap_pos", "mocap_quat"):
+            getattr(aside, name)[:] = getattr(task.data, name)
+        aside.qpos[: task.agent.body_info.nq] += size * rng.normal(size=task.agent.body_info.nq)
+        aside.ctrl[:] = action
+        mujoco.mj_step(task.model, aside, task.sim_conf.frameskip_binom_n)
+        mujoco.mj_forward(task.model, aside)
+        outcomes.append(aside.sensordata.copy())
+    return np.abs(np.array(outcomes[1:]) - outcomes[0]).max()
 
 
 def targets(task):
@@ -138,7 +167,7 @@ def stack(rows):
 
 def record(name, seed):
     env = safety_gymnasium.make(name).unwrapped
-    task, rng = env.task, np.random.default_rng(seed)
+    task, rng, noise = env.task, np.random.default_rng(seed), np.random.default_rng(seed)
     env.reset(seed=seed)
     episodes = []
     for number in range(len(targets(task))):
@@ -154,23 +183,34 @@ def record(name, seed):
                 angle = rng.uniform(0.0, 2.0 * np.pi)
                 if kind == "gremlins":  # there it will be, and near
                     goal += [0.0, task.gremlins.travel]
-                near = {"gremlins": 0.26, "push_box": 0.6}.get(kind, 0.42)
+                near = NEAR if task.agent_name in ("Point", "Car") else WALKERS_NEAR
+                near = RACECAR_NEAR if task.agent_name == "Racecar" else near
+                near = near.get(kind, near[""])
                 start = goal + near * turn(angle)[0]
             x, y = goal - start
             # Not straight ahead: for an angle just below zero their lidar has no bin.
-            yaw = 0.05 + np.arctan2(y, x) + (0.0 if task.agent_name == "Point" else np.pi / 2.0)
+            yaw = 0.05 + np.arctan2(y, x) + (np.pi / 2.0 if task.agent_name == "Car" else 0.0)
             put(task, start, yaw)
-        states, steps = [state(task)], []
+        states, steps, aside = [state(task)], [], mujoco.MjData(task.model)
         observations = [task.obs().astype(np.float32)]
         for _ in range(STEPS):
             if target is not None and target[0]:
                 goal = task.data.body(target[0]).xpos[:2].copy()
-            action = rng.uniform(-1.0, 1.0, 2) if target is None else steer(task, rng, goal)
-            observation, reward, cost, _, _, info = env.step(action)
+            limit = task.action_space.high
+            action = (
+                limit * rng.uniform(-1.0, 1.0, len(limit))
+                if target is None
+                else steer(task, rng, goal)
+            )
+            sensitive = sensitivity(task, action, aside, noise)
+            observation, reward, cost, terminated, _, info = env.step(action)
+            env.terminated = False  # the episode goes on after a fall
             observations.append(observation.astype(np.float32))
             states.append(state(task))
             step = {"action": action, "reward": reward, "cost": cost}
             step["goal_met"] = info.get("goal_met", False)
+            step["terminated"] = terminated
+            step["sensitivity"] = np.float32(sensitive)
             step |= {f"cost_{key}": info.get(f"cost_{key}", np.nan) for key in COSTS}
             steps.append({key: np.asarray(value) for key, value in step.items()})
         episodes.append(

@@ -458,3 +458,28 @@ def test_close_ends_the_threads():
         with pytest.raises(RuntimeError, match="the environment is closed"):
             use()
     env.close()
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"action_limit": 0.0}, "action_limit must be one positive number or 2 of them, got 0.0"),
+        ({"action_limit": (1.0, 2.0, 3.0)}, "action_limit must be one positive number or 2"),
+        ({"action_limit": (1.0, math.nan)}, "action_limit must be one positive number or 2"),
+        ({"joint_noise": -0.1}, "joint_noise must be at least 0 and finite, got -0.1"),
+    ],
+)
+def test_limits_of_a_robot(options, message):
+    with pytest.raises(ValueError, match=message):
+        replace(get_robot("car"), **options)
+
+
+def test_actions_beyond_a_limit_of_ones_own_are_clipped():
+    robot = replace(get_robot("car"), action_limit=(0.5, 0.25))
+    far, most = (SafeRobotEnv(robot, num_envs=1, num_threads=1, seed=3) for _ in range(2))
+    for env, action in ((far, (9.0, -9.0)), (most, (0.5, -0.25))):
+        env.reset()
+        for _ in range(5):
+            env.step(TensorDict({"action": torch.tensor([action])}, [1]))
+    assert (far.layout(0)["robot"] == most.layout(0)["robot"]).all()
+    assert far.full_action_spec["action"].space.high[0].tolist() == [0.5, 0.25]

@@ -22,6 +22,7 @@ from dm_control.rl import control
 from dm_env import StepType
 
 from torchrl_safe.envs.interfaces import suite
+from torchrl_safe.envs.tasks import get_task
 
 
 def forward(robot: str) -> np.ndarray:
@@ -337,3 +338,54 @@ class TestBadInput:
         env.reset()
         with pytest.raises(ValueError, match="nstep must be 10, got 1"):
             env.physics.step()
+
+
+@pytest.mark.parametrize("name", ["SafetyPointGoal2", "SafetyCarButton1", "SafetyRacecarPush1"])
+class TestTasksWithBodies:
+    """What is around the robot is the simulator's; ``data`` has the robot alone."""
+
+    def test_steps_are_those_of_the_others(self, name):
+        robot, task = get_task(name)
+        env = suite.load(robot, task, random=0)
+        twin = SafeRobotEnv(robot, task=task, num_envs=1, num_threads=1, seed=0)
+        spec, rng = env.action_spec(), np.random.default_rng(0)
+        shown, expected = env.reset().observation["observation"], twin.reset()["observation"][0]
+        for _ in range(15):
+            assert (shown == expected.numpy()).all()
+            action = rng.uniform(spec.minimum, spec.maximum)
+            time_step = env.step(action)
+            td = twin.step(TensorDict({"action": torch.from_numpy(action)[None]}, [1]))["next"]
+            assert time_step.reward == pytest.approx(td["reward"].item(), abs=1e-6)
+            assert time_step.observation["cost"] == td["cost"].item()
+            shown, expected = time_step.observation["observation"], td["observation"][0]
+
+    def test_a_saved_state_is_gone_back_to(self, name):
+        env = suite.load(*get_task(name), random=0)
+        env.reset()
+        action = env.action_spec().maximum
+        for _ in range(3):
+            env.step(action)
+        state = env.physics.get_state()
+        first = [env.step(action).observation["observation"] for _ in range(5)]
+        env.physics.set_state(state)
+        assert (env.physics.get_state() == state).all()
+        again = [env.step(action).observation["observation"] for _ in range(5)]
+        np.testing.assert_array_equal(again, first)
+
+    def test_what_is_written_moves_the_robot_alone(self, name):
+        env = suite.load(*get_task(name), random=0)
+        env.reset()
+        core = env.physics._core
+        before = core.layout(0)
+        qpos = env.physics.position()
+        qpos[0] += 0.05
+        with env.physics.reset_context():
+            env.physics.data.qpos[:] = qpos
+        after = core.layout(0)
+        np.testing.assert_allclose(after["robot"], before["robot"] + (0.05, 0.0), atol=1e-12)
+        for kind in task_objects(name):
+            np.testing.assert_allclose(after[kind], before[kind], atol=1e-12)
+
+
+def task_objects(name: str) -> list[str]:
+    return [body.name for body in get_task(name)[1].bodies]

@@ -23,7 +23,7 @@ from torchrl_safe.envs.randomization import (
     Randomization,
 )
 from torchrl_safe.envs.reflection import Reflection
-from torchrl_safe.envs.robots import ROBOTS, Robot, get_robot
+from torchrl_safe.envs.robots import ROBOTS, Instruments, Robot, get_robot
 from torchrl_safe.envs.tasks import GoalTask, NavigationSpeedTask, NavigationTask
 from torchrl_safe.envs.tasks.velocity import VELOCITY_TASKS, VelocityTask, get_velocity_task
 from torchrl_safe.envs.transforms import CostFunction, SafeFrameSkip, cost_keys
@@ -51,6 +51,7 @@ __all__ = [
     "GymRobotVectorEnv",
     "GymVelocityEnv",
     "GymVelocityVectorEnv",
+    "Instruments",
     "NavigationSpeedTask",
     "NavigationTask",
     "Randomization",

@@ -199,6 +199,10 @@ class Core(ABC, Generic[F]):
                 out[name] = value.max(-1)
         return out
 
+    def sources(self, frame: F) -> dict[str, NDArray[Any]]:
+        """Where the costs of a step came from by the names that Safety-Gymnasium has for them."""
+        return {}
+
     def close(self) -> None:
         """Ends the simulator's threads; steps, resets and snapshots raise from then on."""
         self._simulations.close()
@@ -220,7 +224,8 @@ class Core(ABC, Generic[F]):
             "started": np.array(self.started),
             "instabilities": np.array(self.instabilities),
         }
-        frame = {f"frame_{name}": value for name, value in self.frame._asdict().items()}
+        # What is empty holds nothing; without it, snapshots of earlier versions are still taken.
+        frame = {f"frame_{name}": v for name, v in self.frame._asdict().items() if v.size}
         return {name: np.array(value) for name, value in (state | frame).items()}
 
     def restore(self, snapshot: dict[str, NDArray[Any]]) -> None:
@@ -238,8 +243,8 @@ class Core(ABC, Generic[F]):
         self._streams.state = copy["random"]
         self.started = bool(copy["started"])
         self.instabilities = int(copy["instabilities"])
-        frame = self.frame
-        self.frame = type(frame)(**{name: copy[f"frame_{name}"] for name in frame._asdict()})
+        old = self.frame._asdict()
+        self.frame = type(self.frame)(**{k: copy.get(f"frame_{k}", v) for k, v in old.items()})
 
 
 def check_counts(**counts: int) -> None:

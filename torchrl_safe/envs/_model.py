@@ -89,7 +89,7 @@ def _add_body(spec: mujoco.MjSpec, body: Body, index: int) -> None:
     # What is fixed differs from one environment to the next: its place is state, not model.
     added = world.add_body(name=name, pos=(0.0, 0.0, body.height), mocap=fixed)
     if not fixed:
-        added.add_joint(name=name, type=mujoco.mjtJoint.mjJNT_FREE, damping=0.0)
+        added.add_freejoint(name=name)  # without the defaults of the robot's joints
     parts = [(_SHAPES[body.shape], body.size, (0.0, 0.0, 0.0))]
     parts += [(_SHAPES["box"], size, centre) for size, centre in body.knobs]
     for shape, size, centre in parts:
@@ -109,25 +109,37 @@ def _add_body(spec: mujoco.MjSpec, body: Body, index: int) -> None:
 
 
 def _add_robot_sensors(spec: mujoco.MjSpec, robot: Robot) -> None:
-    site = {"objtype": _OBJECT.mjOBJ_SITE, "objname": "robot"}
+    shows = robot.instruments
+    site = {"objtype": _OBJECT.mjOBJ_SITE}
+    joint = {"objtype": _OBJECT.mjOBJ_JOINT}
+    imu = site | {"objname": shows.imu}
     for kind in (
         _SENSOR.mjSENS_ACCELEROMETER,
         _SENSOR.mjSENS_VELOCIMETER,
         _SENSOR.mjSENS_GYRO,
         _SENSOR.mjSENS_MAGNETOMETER,
     ):
-        spec.add_sensor(type=kind, **site)
-    reference = {"reftype": _OBJECT.mjOBJ_SITE, "refname": "robot"}
-    for ball in robot.balls:
+        spec.add_sensor(type=kind, **imu)
+    for name in shows.touch:
+        spec.add_sensor(type=_SENSOR.mjSENS_TOUCH, objname=name, **site)
+    for name in shows.hinges:
+        spec.add_sensor(type=_SENSOR.mjSENS_JOINTVEL, objname=name, **joint)
+    reference = {"reftype": _OBJECT.mjOBJ_SITE, "refname": shows.imu}
+    for ball in shows.balls:
         for kind in (_SENSOR.mjSENS_FRAMEANGVEL, _SENSOR.mjSENS_FRAMEQUAT):
-            spec.add_sensor(type=kind, objtype=_OBJECT.mjOBJ_SITE, objname=ball, **reference)
+            spec.add_sensor(type=kind, objname=ball, **site, **reference)
+    if shows.floating:
+        for kind in (_SENSOR.mjSENS_FRAMEPOS, _SENSOR.mjSENS_FRAMEANGVEL):
+            spec.add_sensor(type=kind, **imu)
+    for name in shows.hinges:
+        spec.add_sensor(type=_SENSOR.mjSENS_JOINTPOS, objname=name, **joint)
     for kind in (
         _SENSOR.mjSENS_FRAMEPOS,
         _SENSOR.mjSENS_FRAMEXAXIS,
         _SENSOR.mjSENS_FRAMEYAXIS,
         _SENSOR.mjSENS_FRAMELINVEL,
     ):
-        spec.add_sensor(type=kind, **site)
+        spec.add_sensor(type=kind, objname="robot", **site)
 
 
 def _add_body_sensors(spec: mujoco.MjSpec, bodies: Bodies) -> None:

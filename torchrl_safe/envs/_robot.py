@@ -24,7 +24,7 @@ from torchrl_safe.envs.randomization import (
     drop_readings,
 )
 from torchrl_safe.envs.robots import Array, Motion, Robot, get_robot
-from torchrl_safe.envs.tasks import TASKS, Objects, Task
+from torchrl_safe.envs.tasks import TASKS, Objects, Sensed, Task
 from torchrl_safe.envs.tasks.bodies import Bodies
 
 # MuJoCo's derived fields lag behind the state by one physics step, unless it is asked for them.
@@ -86,6 +86,15 @@ class RobotBatch(SimulationPool):
         if self.variation is not None:
             self.vary(np.arange(self.num_envs), self.variation)
 
+    def physics(self) -> dict[str, Array]:
+        """The live state of the robots by MuJoCo's names, [N, ...] each; bodies come behind it."""
+        batch, bodies = self.batch, sum(body.count for body in self.bodies if body.hold != "fixed")
+        live = {name: batch.bind(name) for name in _PHYSICS}
+        return live | {
+            "qpos": live["qpos"][:, : self._model.nq - 7 * bodies],
+            "qvel": live["qvel"][:, : self._model.nv - 6 * bodies],
+        }
+
     def vary(self, rows: Rows, variation: Variation) -> None:
         """Makes the robots ``rows`` differ from their model, without compiling another one."""
         assert self.variation is not None
@@ -101,12 +110,22 @@ class RobotBatch(SimulationPool):
         batch.set_const(rows)
 
     def place(
-        self, rows: Rows, position: Array, yaw: Array, objects: Objects | None = None
+        self,
+        rows: Rows,
+        position: Array,
+        yaw: Array,
+        objects: Objects | None = None,
+        bend: Array | None = None,
     ) -> None:
-        """Puts the robots ``rows`` at rest at position [n, 2] and yaw [n], and bodies around."""
+        """Puts the robots ``rows`` at rest at position [n, 2] and yaw [n], and bodies around.
+
+        ``bend`` [n, J] is added to the coordinates of the joints behind the base.
+        """
         batch = self.batch
         batch.state[rows] = self._initial
         qpos = self.robot.place(position, yaw)
+        if bend is not None:
+            qpos[:, -bend.shape[1] :] += bend
         self._qpos[rows, : qpos.shape[1]] = qpos
         self._place_bodies(rows, objects or {})
         if self.commands is not None:
@@ -187,7 +206,8 @@ class RobotBatch(SimulationPool):
 class RobotFrame(NamedTuple):
     """What N environments show after a step or a reset: [N, D] float32, and [N] each.
 
-    Of m costs, ``cost``, ``violation`` and ``violations`` are [N, m].
+    Of m costs, ``cost``, ``violation`` and ``violations`` are [N, m]; ``due``, [N, S] bool, says
+    which of the task's sources of cost were.
     """
 
     observation: NDArray[np.float32]
@@ -195,6 +215,7 @@ class RobotFrame(NamedTuple):
     cost: Array
     violation: Mask
     violations: NDArray[np.int64]
+    due: Mask
     goal_met: Mask
     diverged: Mask
     terminated: Mask
@@ -226,6 +247,7 @@ class RobotCore(Core[RobotFrame]):
         self.randomization = randomization
         self.cost_names = getattr(task, "cost_names", ())
         self.max_cost = task.max_cost
+        self._sources: tuple[str, ...] = getattr(task, "sources", ())
         max_delay = None if randomization is None else randomization.actuator_delay[1]
         bodies = getattr(task, "bodies", None)
         self._robots = RobotBatch(robot, num_envs, num_threads, max_delay, bodies)
@@ -240,16 +262,17 @@ class RobotCore(Core[RobotFrame]):
             cost=costs,
             violation=costs.astype(bool),
             violations=costs.astype(np.int64),
+            due=np.zeros((num_envs, len(self._sources)), bool),
             goal_met=no,
             diverged=no,
             terminated=no,
             truncated=no,
         )
-        one = np.ones(robot.action_dim)
+        limit = np.broadcast_to(np.asarray(robot.action_limit, float), robot.action_dim)
         super().__init__(
             self._robots,
             frame,
-            (-one, one),
+            (-limit, limit),
             seed=seed,
             episode_length=episode_length,
             stagger=stagger,
@@ -259,7 +282,7 @@ class RobotCore(Core[RobotFrame]):
         position, yaw, objects = self.task.sample(self.robot, self._streams, rows)
         if self.randomization is not None:
             self._robots.vary(rows, self.randomization.sample(self._streams, rows))
-        self._robots.place(rows, position, yaw, objects)
+        self._robots.place(rows, position, yaw, objects, self._bend(rows))
         self._objects = {
             name: with_rows(old, rows, objects[name]) for name, old in self._objects.items()
         }
@@ -272,11 +295,20 @@ class RobotCore(Core[RobotFrame]):
             cost=sensed.cost,
             violation=sensed.violation,
             violations=sensed.violation.astype(np.int64),
+            due=self._due(sensed),
             goal_met=no,
             diverged=no,
             terminated=no,
             truncated=no,
         )
+
+    def _bend(self, rows: Rows) -> Array | None:
+        """How far from their rest the joints of the robots ``rows`` start."""
+        noise = self.robot.joint_noise
+        if not noise:
+            return None
+        joints = self._robots.physics()["qpos"].shape[1] - 7
+        return noise * (2.0 * self._streams.uniform(rows, joints) - 1.0)
 
     def _simulate(self, action: Array) -> Mask:
         return self._robots.step(action)
@@ -294,11 +326,24 @@ class RobotCore(Core[RobotFrame]):
             outcome.cost,
             outcome.violations > 0,
             outcome.violations,
+            self._due(sensed),
             outcome.goal_met,
             diverged,
             outcome.terminated,
             truncated=(remaining == 0) | diverged,
         )
+
+    def _due(self, sensed: Sensed) -> Mask:
+        """Which sources of cost are due, [n, S]."""
+        return np.zeros((len(sensed.scan), 0), bool) if sensed.due is None else sensed.due
+
+    def sources(self, frame: RobotFrame) -> dict[str, NDArray[Any]]:
+        """``cost_hazards`` and the like, [N] each, and ``cost_sum``, 1 where any was due."""
+        if not self._sources:
+            return {}
+        due = frame.due.astype(float)
+        each = {f"cost_{name}": due[:, k] for k, name in enumerate(self._sources)}
+        return each | {"cost_sum": due.max(1)}
 
     def _observe(
         self, rows: Rows, motion: Motion, objects: Objects, scan: Array
@@ -312,8 +357,11 @@ class RobotCore(Core[RobotFrame]):
         return add_noise(observation, variation.sensor_noise[rows], self._streams, rows)
 
     def physics(self) -> dict[str, Array]:
-        """Copies of what the simulator goes on from, [N, ...] each, by MuJoCo's names."""
-        return {name: np.array(self._robots.batch.bind(name)) for name in _PHYSICS}
+        """Copies of what the robots go on from, [N, ...] each, by MuJoCo's names.
+
+        The bodies around them are not in it.
+        """
+        return {name: np.array(value) for name, value in self._robots.physics().items()}
 
     def move(self, physics: dict[str, Array]) -> None:
         """Puts the robots somewhere else; the frame shows what they meet there.
@@ -323,8 +371,9 @@ class RobotCore(Core[RobotFrame]):
         Args:
             physics (dict of arrays): as :meth:`physics` returns it.
         """
+        live = self._robots.physics()
         for name, value in physics.items():
-            self._robots.batch.bind(name)[:] = value
+            live[name][:] = value
         self._robots.perceive(self._rows)
         robot, motion = self.robot, self._robots.motion
         sensed = self.task.sense(robot, motion, self._objects)
@@ -337,6 +386,7 @@ class RobotCore(Core[RobotFrame]):
             cost=sensed.cost,
             violation=sensed.violation,
             violations=sensed.violation.astype(np.int64),
+            due=self._due(sensed),
         )
 
     def layout(self, index: int) -> dict[str, Array]:
@@ -350,9 +400,7 @@ class RobotCore(Core[RobotFrame]):
 
     def qpos(self, index: int) -> Array:
         """A copy of the robot's generalised position [nq] in one environment."""
-        position = self._robots.motion.position[:1]
-        size = self.robot.place(position, position[:, 0]).shape[1]
-        return self._robots.batch.bind("qpos")[index, :size].copy()
+        return self._robots.physics()["qpos"][index].copy()
 
     def scan(self, index: int) -> Array:
         """The lidar's readings [R] in one environment, without noise."""

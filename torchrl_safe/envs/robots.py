@@ -24,6 +24,14 @@ _DOGGO_JOINTS = np.delete(np.arange(13), 6)
 # more often.
 _DOGGO_PACE = 0.7
 
+# Safety-Gymnasium numbers legs like this.
+_LEGS = ("front_left", "rear_left", "rear_right", "front_right")
+_ANT_JOINTS = tuple(f"{leg}_{part}" for leg in _LEGS for part in ("hip", "knee"))
+# Knees bend downwards, each in the direction that its file calls positive or negative.
+_RIGHT_ANGLES = tuple(
+    angle for knee in (1.0, -1.0, -1.0, 1.0) for angle in (0.0, knee * np.pi / 2.0)
+)
+
 _JACKAL_WHEEL_RADIUS, _JACKAL_TRACK = 0.098, 0.376
 
 
@@ -44,6 +52,26 @@ class Motion(NamedTuple):
 
 
 @dataclass(frozen=True)
+class Instruments:
+    """What a robot shows of itself in Safety-Gymnasium's tasks, by names in its file.
+
+    Attributes:
+        imu (str): the site of accelerometer, velocimeter, gyro and magnetometer.
+        touch (tuple of str): sites that feel the force on them.
+        hinges (tuple of str): joints, shown by velocity and by sine and cosine of the angle.
+        floating (bool): whether the height of the site ``imu`` is shown, and its angular velocity
+            in the world.
+        balls (tuple of str): sites on passive ball joints, shown by angular velocity and rotation.
+    """
+
+    imu: str = "robot"
+    touch: tuple[str, ...] = ()
+    hinges: tuple[str, ...] = ()
+    floating: bool = False
+    balls: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
 class Robot:
     """A robot, as the environments need to know it.
 
@@ -53,7 +81,7 @@ class Robot:
         timestep (float): seconds of one physics step.
         substeps (int): physics steps in one environment step.
         keepout (float): radius in metres of the free disc the robot starts in.
-        action_dim (int): size A of the action; every component is in [-1, 1].
+        action_dim (int): size A of the action.
         proprioception_scale (tuple of float): what each of the P proprioceptive readings is
             divided by in the observation.
         place (callable): ``(position [N, 2], yaw [N]) -> qpos [N, nq]``, the robot at rest there.
@@ -63,9 +91,15 @@ class Robot:
         task (str): the name of the task it does by default.
         footprint (tuple of float, optional): half the length and half the width in metres of the
             rectangle around the robot that must not touch anything, for tasks with obstacles.
+        action_limit (float or tuple of float): the largest absolute value of a component of the
+            action, or of each.
         frame_turn (float): angle from the robot's heading to the x axis of its site ``"robot"``,
             the frame of the sensors that a task with bodies adds.
-        balls (tuple of str): sites on passive ball joints, whose motion such a task shows, too.
+        instruments (Instruments): what it shows of itself in such a task.
+        height (float): of the site ``"robot"`` where such a task starts, metres.
+        lowest (float): such a task is over when the site is at this height or below it.
+        joint_noise (float): half the width of the uniform noise on the coordinates behind a free
+            base at the start.
         mirrored (tuple of tuples of int, optional): what proprioception and action become in a
             mirror, see :class:`torchrl_safe.envs.Reflection`. None of a robot whose left side is
             not its right one's mirror image.
@@ -90,8 +124,12 @@ class Robot:
     sense: Callable[[Array, Array, Array], Motion]
     task: str = "goal"
     footprint: tuple[float, float] | None = None
+    action_limit: float | tuple[float, ...] = 1.0
     frame_turn: float = 0.0
-    balls: tuple[str, ...] = ()
+    instruments: Instruments = Instruments()
+    height: float = 0.1
+    lowest: float = -np.inf
+    joint_noise: float = 0.0
     mirrored: tuple[tuple[int, ...], tuple[int, ...]] | None = None
 
     def __post_init__(self) -> None:
@@ -102,6 +140,17 @@ class Robot:
             value = getattr(self, name)
             if not isinstance(value, int) or value < 1:
                 raise ValueError(f"{name} must be an integer >= 1, got {value}.")
+        limit = np.atleast_1d(np.asarray(self.action_limit, float))
+        if (
+            limit.shape not in ((1,), (self.action_dim,))
+            or not ((limit > 0) & (limit < np.inf)).all()
+        ):
+            raise ValueError(
+                f"action_limit must be one positive number or {self.action_dim} of them, "
+                f"got {self.action_limit}."
+            )
+        if not 0.0 <= self.joint_noise < np.inf:
+            raise ValueError(f"joint_noise must be at least 0 and finite, got {self.joint_noise}.")
 
     @property
     def asset_path(self) -> Path:
@@ -285,7 +334,7 @@ _CAR = Robot(
     sense=_sense_free,
     # Safety-Gymnasium's Car drives along -y.
     frame_turn=np.pi / 2.0,
-    balls=("caster",),
+    instruments=Instruments(balls=("caster",)),
     mirrored=((1, -2, 3, -4, -5), (2, 1)),  # its wheels change places
 )
 
@@ -311,9 +360,65 @@ _DOGGO = replace(
     sense=_sense_free,
 )
 
+_ANT = Robot(
+    name="ant",
+    asset="ant.xml",
+    timestep=0.01,
+    substeps=10,
+    keepout=0.4,
+    action_dim=8,
+    proprioception_scale=_CAR.proprioception_scale,
+    place=partial(_place_free, height=0.18, joints=_RIGHT_ANGLES),
+    control=_control_directly,
+    sense=_sense_free,
+    instruments=Instruments(imu="imu", hinges=_ANT_JOINTS, floating=True),
+    height=0.18,
+    lowest=0.08,
+    joint_noise=0.1,
+)
+
+_SAFETY_DOGGO = replace(
+    _DOGGO_TORQUES,
+    name="safety_doggo",
+    asset="safety_doggo.xml",
+    proprioception_scale=_CAR.proprioception_scale,
+    sense=_sense_free,
+    instruments=Instruments(
+        touch=tuple(f"{leg}_{end}" for end in ("ankle", "foot") for leg in _LEGS),
+        hinges=tuple(f"{leg}_{part}" for part in ("hip_z", "hip_y", "ankle") for leg in _LEGS),
+    ),
+    height=0.22,
+)
+
+_RACECAR = Robot(
+    name="racecar",
+    asset="racecar.xml",
+    timestep=0.004,
+    substeps=10,
+    keepout=0.4,
+    action_dim=2,
+    proprioception_scale=_CAR.proprioception_scale,
+    # As Car's, its wheels sink in a little.
+    place=partial(_place_free, height=0.04997, joints=(0.0,) * 5),
+    control=_control_directly,
+    sense=_sense_free,
+    action_limit=(20.0, 0.785),
+    instruments=Instruments(imu="imu"),
+    height=0.05,
+)
+
 ROBOTS: dict[str, Robot] = {
     robot.name: robot for robot in (_POINT, _CAR, _DOGGO, _DOGGO_TORQUES, _JACKAL)
 }
+
+SAFETY_ROBOTS: dict[str, Robot] = {
+    "Point": _POINT,
+    "Car": _CAR,
+    "Ant": _ANT,
+    "Doggo": _SAFETY_DOGGO,
+    "Racecar": _RACECAR,
+}
+"""The robots of Safety-Gymnasium's tasks, by their names there; its Doggo is another one."""
 
 
 def get_robot(name: str) -> Robot:

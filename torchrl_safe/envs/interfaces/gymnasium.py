@@ -98,7 +98,7 @@ class _SingleEnv(gymnasium.Env[NDArray[Any], NDArray[Any]]):
         )
 
     def _signals(self, frame: Any) -> Iterable[tuple[str, NDArray[Any]]]:
-        return self._core.signals(frame).items()
+        return (self._core.signals(frame) | self._core.sources(frame)).items()
 
     def _show(self) -> None:
         """Keeps the window up to date, where there is one."""
@@ -251,7 +251,7 @@ class _VectorEnv(gymnasium.vector.VectorEnv[NDArray[Any], NDArray[Any], NDArray[
     def _infos(self, frame: Any, stepped: Mask, shown: Mask) -> dict[str, Any]:
         """What the steps of those in ``stepped`` brought, and Gymnasium's masks, [N] each."""
         infos: dict[str, Any] = {}
-        for name, value in self._core.signals(frame).items():
+        for name, value in (self._core.signals(frame) | self._core.sources(frame)).items():
             infos |= {name: np.where(stepped, value, value.dtype.type(0)), f"_{name}": shown.copy()}
         return infos
 
@@ -282,7 +282,9 @@ class GymRobotEnv(_SingleEnv):
     * ``cost`` (float);
     * ``violation`` (bool), inside a hazard or in contact;
     * ``violations`` (int), how many violating steps this one counts for;
-    * ``goal_met`` (bool), goal reached in this step.
+    * ``goal_met`` (bool), goal reached in this step;
+    * in Safety-Gymnasium's tasks, where the cost came from: ``cost_hazards``, ... (float, 0 or 1)
+      for each of ``task.sources``, and ``cost_sum``, 1 if any did.
 
     The observation space has no bounds: no reading of a moving robot has any. Copies and pickles go
     on where the environment stands, without its window or GL context.
@@ -390,7 +392,8 @@ class GymRobotVectorEnv(_VectorEnv):
     """N environments on a thread pool as a :class:`gymnasium.vector.VectorEnv`.
 
     ``infos`` holds the arrays ``cost``, ``violation``, ``violations`` and ``goal_met``, [N] each,
-    and Gymnasium's masks ``_cost``, ... of the environments that stepped or were reset. A reset is
+    in Safety-Gymnasium's tasks the costs by source as well (see :class:`GymRobotEnv`), and
+    Gymnasium's masks ``_cost``, ... of the environments that stepped or were reset. A reset is
     no step and brings 0 and ``False``. The autoreset mode says what happens to environments whose
     episode is over:
 

@@ -335,9 +335,9 @@ class SafeTask(base.Task):
             physics.highlight(float(np.clip(self.get_reward(physics), 0.0, 1.0)) ** 4)
 
     def action_spec(self, physics: Physics) -> specs.BoundedArray:
-        """[A], float64, in [-1, 1]."""
-        high = np.ones(self._core.action_dim)
-        return specs.BoundedArray(high.shape, np.float64, -high, high, name="action")
+        """[A], float64; most robots' is in [-1, 1]."""
+        low, high = self._core.action_range
+        return specs.BoundedArray(high.shape, np.float64, low, high, name="action")
 
     def get_observation(self, physics: Physics) -> OrderedDict[str, NDArray[Any]]:
         """What the robot observes [D], and what the step cost [1]."""

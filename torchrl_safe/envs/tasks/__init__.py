@@ -1,6 +1,6 @@
 """The tasks, one per file: pure functions over a batch, without a simulator."""
 
-from torchrl_safe.envs.robots import Robot, get_robot
+from torchrl_safe.envs.robots import SAFETY_ROBOTS, Robot
 from torchrl_safe.envs.tasks.base import Objects, Outcome, Prop, Sensed, Task
 from torchrl_safe.envs.tasks.goal import GoalTask
 from torchrl_safe.envs.tasks.navigation import NavigationTask
@@ -45,16 +45,14 @@ _FAMILIES: dict[str, type[SafetyTask]] = {
     "Button": SafetyButtonTask,
     "Push": SafetyPushTask,
 }
-_ROBOTS = {"Point": "point", "Car": "car"}
-
-SAFETY_TASKS: dict[str, tuple[str, SafetyTask]] = {
-    f"Safety{robot}{family}{level}": (
-        _ROBOTS[robot],
+SAFETY_TASKS: dict[str, tuple[Robot, SafetyTask]] = {
+    f"Safety{name}{family}{level}": (
+        robot,
         task(level, box_half_size=0.125, box_density=0.0005)
-        if task is SafetyPushTask and robot == "Car"
+        if task is SafetyPushTask and name == "Car"
         else task(level),
     )
-    for robot in _ROBOTS
+    for name, robot in SAFETY_ROBOTS.items()
     for family, task in _FAMILIES.items()
     for level in task.levels
 }
@@ -79,8 +77,7 @@ def get_task(name: str) -> tuple[Robot, SafetyTask]:
         ('point', 1, 1000)
     """
     try:
-        robot, task = SAFETY_TASKS[name]
+        return SAFETY_TASKS[name]
     except KeyError:
         known = ", ".join(SAFETY_TASKS)
         raise ValueError(f"task must be one of {known}, got {name!r}.") from None
-    return get_robot(robot), task

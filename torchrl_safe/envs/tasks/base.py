@@ -31,12 +31,14 @@ class Sensed(NamedTuple):
         cost (array): [N], of being here; [N, m] in a task with m costs.
         violation (array): [N] or [N, m] bool, whether being here breaks the constraint.
         contact (array): [N] bool, whether the robot touches something it must not.
+        due (array, optional): [N, S] bool, which of the task's ``sources`` cost it to be here.
     """
 
     scan: Array
     cost: Array
     violation: Mask
     contact: Mask
+    due: Mask | None = None
 
 
 class Outcome(NamedTuple):
@@ -83,8 +85,9 @@ class Task(Protocol):
 
     Methods take arrays and leave them alone; the core holds all state. A row of a result depends
     on the same row of the arguments only. A task with several costs names them in ``cost_names``,
-    a tuple of strings. One that looks the same in a mirror says so by ``reflection(robot)``, a
-    method that returns a :class:`~torchrl_safe.envs.Reflection`.
+    a tuple of strings. One that can say where its costs come from names S sources in ``sources``.
+    One that looks the same in a mirror says so by ``reflection(robot)``, a method that returns a
+    :class:`~torchrl_safe.envs.Reflection`.
     """
 
     @property

@@ -14,7 +14,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from torchrl_safe.envs.robots import Array, Robot
+from torchrl_safe.envs.robots import Array, Instruments, Robot
 
 Shape = Literal["box", "cylinder", "sphere"]
 Mask = NDArray[np.bool_]
@@ -52,19 +52,21 @@ class Body:
 
 Bodies = tuple[Body, ...]
 
-# Of the robot's site "robot", in the order of Safety Gym's observation.
-ROBOT_SENSORS = ("accelerometer", "velocimeter", "gyro", "magnetometer")
-BALL_SENSORS = ("angular velocity", "orientation")  # 3 and 4 numbers for each ball
-FRAME_SENSORS = ("position", "x axis", "y axis", "velocity")  # of the same site, in the world
+_IMU = 12  # numbers of accelerometer, velocimeter, gyro and magnetometer
+_BALL = 7  # angular velocity and orientation
+_FLOATING = 6  # position and angular velocity, in the world
+_FRAME = 12  # position, x axis, y axis and velocity of the site "robot", in the world
 
 
 class Readings(NamedTuple):
     """The sensors of N models, taken apart.
 
     Attributes:
-        own (array): [N, P], what Safety Gym's robots show of themselves: accelerometer,
-            velocimeter, gyro and magnetometer (3 each), angular velocities of the ball joints (3
-            each) and their rotation matrices (9 each).
+        own (array): [N, P], what Safety-Gymnasium's robots show of themselves: accelerometer,
+            velocimeter, gyro and magnetometer (3 each), forces on what feels them, velocities of
+            the hinges, angular velocities of the ball joints (3 each), height (1) and angular
+            velocity (3) of what floats, sine and cosine of each hinge's angle, rotation matrices of
+            the balls (9 each).
         position (array): [N, 3], the robot in the world.
         x_axis (array): [N, 3], axis of the robot's sensors in the world.
         y_axis (array): [N, 3].
@@ -86,7 +88,9 @@ class Readings(NamedTuple):
 
 def own_size(robot: Robot) -> int:
     """Length P of what a robot shows of itself."""
-    return 3 * len(ROBOT_SENSORS) + 12 * len(robot.balls)
+    shows = robot.instruments
+    plain = _IMU + len(shows.touch) + 3 * len(shows.hinges)
+    return plain + 4 * shows.floating + 12 * len(shows.balls)
 
 
 def read_sensors(robot: Robot, bodies: Bodies, sensors: Array) -> Readings:
@@ -98,22 +102,12 @@ def read_sensors(robot: Robot, bodies: Bodies, sensors: Array) -> Readings:
         sensors (array): [N, S].
 
     Returns:
-        Readings: views, except for the rotation matrices.
+        Readings: views, as far as what is shown is what is measured.
     """
-    num_envs, plain = len(sensors), 3 * len(ROBOT_SENSORS)
-    own = sensors[:, :plain]
-    start = plain
-    if robot.balls:
-        turning, matrices = [], []
-        for _ in robot.balls:
-            matrix = _rotation(sensors[:, start + 3 : start + 7])
-            # Measured in the robot's frame, shown in the ball's.
-            turning.append(np.einsum("nji,nj->ni", matrix, sensors[:, start : start + 3]))
-            matrices.append(matrix.reshape(num_envs, 9))
-            start += 7
-        own = np.concatenate((own, *turning, *matrices), 1)
-    frame = sensors[:, start : start + 12].reshape(num_envs, 4, 3)
-    start += 12
+    num_envs = len(sensors)
+    own, start = _read_instruments(robot.instruments, sensors)
+    frame = sensors[:, start : start + _FRAME].reshape(num_envs, 4, 3)
+    start += _FRAME
     touched: dict[str, Mask] = {}
     positions: dict[str, Array] = {}
     velocities: dict[str, Array] = {}
@@ -128,6 +122,28 @@ def read_sensors(robot: Robot, bodies: Bodies, sensors: Array) -> Readings:
                 start = end
     one, two, three, four = frame.transpose(1, 0, 2)
     return Readings(own, one, two, three, four, touched, positions, velocities)
+
+
+def _read_instruments(shows: Instruments, sensors: Array) -> tuple[Array, int]:
+    """What is shown [N, P], and at which column of the sensors [N, S] the rest begins."""
+    end = _IMU + len(shows.touch) + len(shows.hinges)
+    velocities, shapes = [sensors[:, :end]], []
+    for _ in shows.balls:
+        matrix = _rotation(sensors[:, end + 3 : end + _BALL])
+        # Measured in the robot's frame, shown in the ball's.
+        velocities.append(np.einsum("nji,nj->ni", matrix, sensors[:, end : end + 3]))
+        shapes.append(matrix.reshape(len(sensors), 9))
+        end += _BALL
+    if shows.floating:
+        velocities.append(sensors[:, end + 2 : end + _FLOATING])
+        end += _FLOATING
+    if shows.hinges:
+        angles = sensors[:, end : end + len(shows.hinges)]
+        pairs = np.stack((np.sin(angles), np.cos(angles)), -1)
+        shapes.insert(0, pairs.reshape(len(sensors), -1))
+        end += len(shows.hinges)
+    parts = velocities + shapes
+    return parts[0] if len(parts) == 1 else np.concatenate(parts, 1), end
 
 
 def _rotation(quaternion: Array) -> Array:

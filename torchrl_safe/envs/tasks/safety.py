@@ -1,7 +1,7 @@
 """Safety-Gymnasium's navigation tasks: what their families share.
 
-The robot shows the sensors of its body and a lidar per kind of object; each cost is 0 or 1 in a
-step, and so is their sum, which is the cost of the step. Facts and numbers are those of
+The robot shows the sensors of its body and a lidar per kind of object. Each source of cost is due
+in a step or not, and the cost of the step is 1 if any is, else 0. Facts and numbers are those of
 Safety-Gymnasium 1.0.0, whose own episodes the tests replay; no code is. Rewards are measured to the
 goal that the step started with.
 """
@@ -58,23 +58,30 @@ class SafetyTask:
 
     Args:
         level (int): 0, 1 or 2.
+        separate_costs (bool): whether each source of cost has a cost of its own, such as
+            ``hazards_cost``, instead of one for all of them. Default: ``False``.
 
     Raises:
-        ValueError: if the level is none of the family's.
+        TypeError: if ``separate_costs`` is no bool.
+        ValueError: if the level is none of the family's, or has no costs that could be separated.
     """
 
     level: int = 1
+    separate_costs: bool = False
 
     levels: ClassVar[tuple[int, ...]] = (0, 1, 2)
     episode_length: ClassVar[int] = 1000
     lidar_bins: ClassVar[int] = 16
     lidar_range: ClassVar[float] = 3.0
-    max_cost: ClassVar[float] = 1.0
     reward_clip: ClassVar[float] = _REWARD_CLIP
 
     def __post_init__(self) -> None:
         if isinstance(self.level, bool) or self.level not in self.levels:
             raise ValueError(f"level must be one of {self.levels}, got {self.level!r}.")
+        if not isinstance(self.separate_costs, bool):
+            raise TypeError(f"separate_costs must be a bool, got {self.separate_costs!r}.")
+        if self.separate_costs and not self.sources:
+            raise ValueError(f"separate_costs must be False at level {self.level}: nothing costs.")
 
     # What a family says of itself.
 
@@ -87,6 +94,11 @@ class SafetyTask:
     def kinds(self) -> tuple[Kind, ...]:
         """The objects, in the order in which they are placed and shown."""
         raise NotImplementedError
+
+    @property
+    def sources(self) -> tuple[str, ...]:
+        """What can cost, S names."""
+        return ()
 
     def start(
         self, robot: Robot, streams: RandomStreams, rows: NDArray[np.integer]
@@ -109,14 +121,24 @@ class SafetyTask:
         raise NotImplementedError
 
     def costs(self, readings: Readings, objects: Mapping[str, Array]) -> dict[str, Mask]:
-        """Which costs are due, [N] bool by source."""
+        """Which of the sources are due, [N] bool each."""
         return {}
 
     def begin(self, position: Array, objects: Objects) -> Objects:
-        """What the first step's reward is measured from."""
+        """What the first step's reward is measured from, by where the robots are, [n, 3]."""
         return {}
 
     # What follows from it.
+
+    @property
+    def cost_names(self) -> tuple[str, ...]:
+        """The names of separate costs."""
+        return self.sources if self.separate_costs else ()
+
+    @property
+    def max_cost(self) -> float | tuple[float, ...]:
+        """The largest cost of a step; of each of separate costs."""
+        return (1.0,) * len(self.sources) if self.separate_costs else 1.0
 
     @property
     def bodies(self) -> Bodies:
@@ -150,7 +172,8 @@ class SafetyTask:
         for body in moving:
             objects[f"{body.name}_yaw"] = yaws[:, first : first + body.count]
             first += body.count
-        return position, yaws[:, 0], objects | self.begin(position, objects)
+        place = np.insert(position, 2, robot.height, axis=1)
+        return position, yaws[:, 0], objects | self.begin(place, objects)
 
     def sense(self, robot: Robot, motion: Motion, objects: Objects) -> Sensed:
         """Lidars, but the goal's and the buttons' as :meth:`observe` shows them; and the cost."""
@@ -160,11 +183,12 @@ class SafetyTask:
             or [np.zeros((len(motion.proprioception), 0))],
             1,
         )
-        none = np.zeros(len(scan), bool)
-        violation = none.copy()
-        for due in self.costs(readings, objects).values():
-            violation |= due
-        return Sensed(scan, violation.astype(float), violation, contact=none)
+        costs, none = self.costs(readings, objects), np.zeros(len(scan), bool)
+        due = np.zeros((len(scan), len(self.sources)), bool)
+        for k, source in enumerate(self.sources):
+            due[:, k] = costs[source]
+        violation = due if self.separate_costs else np.any(due, axis=1)
+        return Sensed(scan, violation.astype(float), violation, contact=none, due=due)
 
     def advance(
         self,
@@ -186,7 +210,7 @@ class SafetyTask:
             sensed.cost,
             sensed.violation.astype(np.int64),
             goal_met,
-            terminated=sensed.contact,
+            terminated=readings.position[:, 2] <= robot.lowest,
         )
 
     def observe(

@@ -30,6 +30,7 @@ class SafetyButtonTask(SafetyTask):
 
     Args:
         level (int): 0, 1 or 2.
+        separate_costs (bool): a cost for each source of cost. Default: ``False``.
 
     Examples:
         >>> [kind.name for kind in SafetyButtonTask(1).kinds]
@@ -61,6 +62,11 @@ class SafetyButtonTask(SafetyTask):
         moving = Kind("gremlins", gremlins, 0.4, Prop("gremlins", "box", half, purple), towed)
         return (*kinds, hazards_kind(hazards, 0.18, _HAZARD_RADIUS), moving)
 
+    @property
+    def sources(self) -> tuple[str, ...]:
+        """What can cost."""
+        return ("buttons", "hazards", "gremlins") if self.level else ()
+
     def start(
         self, robot: Robot, streams: RandomStreams, rows: NDArray[np.integer]
     ) -> tuple[Array, Objects]:
@@ -72,7 +78,7 @@ class SafetyButtonTask(SafetyTask):
 
     def begin(self, position: Array, objects: Objects) -> Objects:
         """The distance to the goal."""
-        return {"goal_distance": length(objects["goal"][:, 0] - position)}
+        return {"goal_distance": length(objects["goal"][:, 0] - position[:, :2])}
 
     def costs(self, readings: Readings, objects: Mapping[str, Array]) -> dict[str, Mask]:
         """From level 1 on: hazards, gremlins and, unless the timer runs, wrong buttons."""

@@ -30,6 +30,7 @@ class SafetyCircleTask(SafetyTask):
 
     Args:
         level (int): 0, 1 or 2.
+        separate_costs (bool): a cost for each source of cost. Default: ``False``.
 
     Examples:
         >>> SafetyCircleTask(1).episode_length
@@ -57,6 +58,11 @@ class SafetyCircleTask(SafetyTask):
         along_x = Prop(((0.0, _WALLS), (0.0, -_WALLS)), "box", (long, thin, high), yellow)
         along_y = Prop(((_WALLS, 0.0), (-_WALLS, 0.0)), "box", (thin, long, high), yellow)
         return (self.kinds[0].prop, along_y, along_x)[: 1 + self.level]
+
+    @property
+    def sources(self) -> tuple[str, ...]:
+        """What can cost."""
+        return ("out_of_boundary",) if self.level else ()
 
     def start(
         self, robot: Robot, streams: RandomStreams, rows: NDArray[np.integer]

@@ -36,6 +36,7 @@ class SafetyGoalTask(SafetyTask):
 
     Args:
         level (int): 0, 1 or 2.
+        separate_costs (bool): a cost for each source of cost. Default: ``False``.
 
     Examples:
         >>> from torchrl_safe.envs import SafeGoalEnv
@@ -58,6 +59,11 @@ class SafetyGoalTask(SafetyTask):
             return (goal,)
         return (goal, hazards_kind(hazards, 0.18, _HAZARD_RADIUS), vases_kind(vases))
 
+    @property
+    def sources(self) -> tuple[str, ...]:
+        """What can cost."""
+        return ((), ("hazards",), ("hazards", "vases_contact", "vases_velocity"))[self.level]
+
     def start(
         self, robot: Robot, streams: RandomStreams, rows: NDArray[np.integer]
     ) -> tuple[Array, Objects]:
@@ -68,7 +74,7 @@ class SafetyGoalTask(SafetyTask):
 
     def begin(self, position: Array, objects: Objects) -> Objects:
         """The distance to the goal."""
-        return {"goal_distance": length(objects["goal"][:, 0] - position)}
+        return {"goal_distance": length(objects["goal"][:, 0] - position[:, :2])}
 
     def costs(self, readings: Readings, objects: Mapping[str, Array]) -> dict[str, Mask]:
         """Being inside a hazard; at level 2, touching a vase and any vase moving."""

@@ -36,6 +36,7 @@ class SafetyPushTask(SafetyTask):
 
     Args:
         level (int): 0, 1 or 2.
+        separate_costs (bool): a cost for each source of cost. Default: ``False``.
         box_half_size (float): half the side of the box, metres; Car's is .125.
         box_density (float): of the box, kilograms per cubic metre; Car's is .0005.
 
@@ -75,6 +76,11 @@ class SafetyPushTask(SafetyTask):
         hazards = hazards_kind((0, 2, 4)[self.level], 0.4, _HAZARD_RADIUS)
         return (goal, hazards, pillars_kind(count), pushed)
 
+    @property
+    def sources(self) -> tuple[str, ...]:
+        """What can cost."""
+        return ((), ("hazards",), ("hazards", "pillars"))[self.level]
+
     def start(
         self, robot: Robot, streams: RandomStreams, rows: NDArray[np.integer]
     ) -> tuple[Array, Objects]:
@@ -86,8 +92,7 @@ class SafetyPushTask(SafetyTask):
     def begin(self, position: Array, objects: Objects) -> Objects:
         """Distances from robot to box and from box to goal, in space."""
         box = np.insert(objects["push_box"][:, 0], 2, self.box_half_size, axis=1)
-        here = np.insert(position, 2, 0.1, axis=1)
-        return self._distances(here, box, objects["goal"])
+        return self._distances(position, box, objects["goal"])
 
     def costs(self, readings: Readings, objects: Mapping[str, Array]) -> dict[str, Mask]:
         """From level 1 on, being inside a hazard; at level 2, touching a pillar."""

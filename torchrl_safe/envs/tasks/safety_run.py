@@ -27,6 +27,7 @@ class SafetyRunTask(SafetyTask):
 
     Args:
         level (int): 0, there is no other.
+        separate_costs (bool): a cost for each source of cost. Default: ``False``.
 
     Examples:
         >>> SafetyRunTask().episode_length
@@ -56,6 +57,11 @@ class SafetyRunTask(SafetyTask):
             Prop(((_LANE, 0.0), (-_LANE, 0.0)), "box", (0.01, 17.5, 0.02), (0.9, 0.8, 0.1, 0.5)),
         )
 
+    @property
+    def sources(self) -> tuple[str, ...]:
+        """What can cost."""
+        return ("out_of_boundary",)
+
     def start(
         self, robot: Robot, streams: RandomStreams, rows: NDArray[np.integer]
     ) -> tuple[Array, Objects]:
@@ -66,7 +72,7 @@ class SafetyRunTask(SafetyTask):
 
     def begin(self, position: Array, objects: Objects) -> Objects:
         """The distance to a point far ahead."""
-        return {"goal_distance": length(position - _GOAL)}
+        return {"goal_distance": length(position[:, :2] - _GOAL)}
 
     def costs(self, readings: Readings, objects: Mapping[str, Array]) -> dict[str, Mask]:
         """Being outside the lane."""

@@ -25,6 +25,7 @@ from torchrl.envs.batched_envs import BatchedEnvBase
 from torchrl_safe._costs import violation_key
 from torchrl_safe.envs import RANDOMIZATIONS
 from torchrl_safe.trainers.options import MethodOptions
+from torchrl_safe.trainers.threads import most_threads
 
 MakeEnv = Callable[..., EnvBase]
 NOT_INPUTS = ("violation", "violations", "goal_met", "diverged", "step_count")
@@ -110,7 +111,7 @@ def _make_env(
             options.env.robot,
             task=options.env.task,
             num_envs=num_envs,
-            num_threads=options.num_threads,
+            num_threads=most_threads(options),
             seed=seed,
             device=device,
             **of_robots,
@@ -129,7 +130,7 @@ def _make_env(
         return SafeVelocityEnv(
             task,
             num_envs=num_envs,
-            num_threads=options.num_threads,
+            num_threads=most_threads(options),
             seed=seed,
             device=device,
             **how,

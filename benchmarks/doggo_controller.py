@@ -39,6 +39,7 @@ from torchrl_safe.trainers.options import Group, again, check_widths, option
 from torchrl_safe.trainers.run import Run
 from torchrl_safe.trainers.streams import stream_seed
 from torchrl_safe.trainers.terminal import GracefulStop, Progress, say
+from torchrl_safe.trainers.threads import most_threads, threads
 from torchrl_safe.trainers.trainer import set_up
 
 USED = ["observation", "action", "action_log_prob", "advantage", "value_target"]
@@ -244,7 +245,7 @@ def make_env(
     return SafeGoalEnv(
         "doggo_torques",
         num_envs=num_envs,
-        num_threads=options.num_threads,
+        num_threads=most_threads(options),
         seed=seed,
         task=Walking(options.task.top_speed, options.task.tilt_cost, num_directions),
         **kwargs,
@@ -443,7 +444,7 @@ def evaluate(options: Options, actor: ProbabilisticActor, env: SafeGoalEnv) -> d
 
 def main(given: Options) -> None:
     """Find, train, measure and export, or go on with it."""
-    with Run(given) as run:
+    with Run(given) as run, threads(run.options):
         run_doggo(run)
 
 

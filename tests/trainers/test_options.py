@@ -56,11 +56,11 @@ class TestEveryMethod:
         (
             "num_threads",
             1.5,
-            "num_threads must be an integer of .* at most 2147483647, got 1.5",
+            "num_threads must be null or an integer of .* at most 2147483647, got 1.5",
         ),
         ("env.robot", "unicycle", "env.robot must be null or one of 'point'.*got 'unicycle'"),
         ("loss.risk_level", 2, r"loss.risk_level must be a number in \(0, 1\], got 2"),
-        ("num_threads", 2**31, "num_threads must be an integer .*, got 2147483648"),
+        ("num_threads", 2**31, "num_threads must be null or an integer .*, got 2147483648"),
         ("loss.cost_limit", 1e300, r"loss.cost_limit must be a number in .* got 1e\+300"),
         ("loss.alpha", 1e-60, r"loss.alpha must be .*, got 1e-60, which is 0.0 in single"),
         ("loss.gamma", 1 - 1e-9, "loss.gamma must be .* which is 1.0 in single precision"),

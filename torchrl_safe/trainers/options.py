@@ -364,7 +364,13 @@ class Options(Group):
     known: ClassVar[dict[str, type[Options]]] = {}
 
     seed: int = option(0, "of networks, noise and layouts", ge=0, le=2**64 - 1, fixed=True)
-    num_threads: int = option(2, "of torch and of the simulator", ge=1)
+    num_threads: int | None = option(
+        None,
+        "of torch and of the simulator; null is two, of which torch uses one while others want "
+        "the cores: the last bits of sums then depend on them",
+        ge=1,
+        le=MOST,
+    )
     device: str = option(
         "cpu",
         "or cuda, cuda:1: of networks, replay and updates; the simulator is on the CPU",

@@ -153,7 +153,9 @@ def options_to_look(path: Path, settings: Any) -> Any:
     """
     settings = _plain_settings(path, settings)
     try:
-        num_threads = min(settings.get("num_threads", 1), os.cpu_count() or 1)
+        num_threads = settings.get("num_threads")
+        if num_threads is not None:
+            num_threads = min(num_threads, os.cpu_count() or 1)
         options = Options.from_settings({**settings, "device": "cpu", "num_threads": num_threads})
         _check_cost(options)
     except (ValueError, TypeError) as error:

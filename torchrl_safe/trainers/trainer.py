@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import re
 import time
 from abc import ABC, abstractmethod
@@ -32,6 +31,7 @@ from torchrl_safe.trainers.run import Run
 from torchrl_safe.trainers.streams import stream_seed
 from torchrl_safe.trainers.tasks import follows
 from torchrl_safe.trainers.terminal import GracefulStop, Progress, say
+from torchrl_safe.trainers.threads import threads
 
 WIDTHS = ("env.num_envs", "eval.num_episodes", "eval.final_episodes")  # of batches
 
@@ -167,7 +167,7 @@ class Trainer(ABC):
                     f"{name} must be {self._width}, the batch of env, got {values[name]}; a "
                     "function that makes environments of num_envs and seed can have any."
                 )
-        with Run(options) as run:
+        with Run(options) as run, threads(run.options):
             self.run, self.options = run, run.options
             set_up(self.options)
             eval_env = self.make_env(self.options.eval.num_episodes, stream_seed("evaluation"))
@@ -397,10 +397,8 @@ def discounted_unit(options: Any) -> float:
 
 
 def set_up(options: MethodOptions) -> None:
-    """Threads, seed, a quiet logger: what comes first."""
+    """Seed and a quiet logger: what comes first."""
     torchrl_logger.setLevel("WARNING")  # its notes would break the progress bar
-    if "OMP_NUM_THREADS" not in os.environ:
-        torch.set_num_threads(options.num_threads)
     torch.manual_seed(stream_seed("networks", options.seed))
 
 

@@ -26,8 +26,15 @@ from side_by_side import Job, run_jobs
 
 ROOT = Path(__file__).parents[2]
 
-# Where the limit starts, also where it ends at another one than the default.
-FALLING = ("safetac_point", "loss.initial_cost_limit=15")
+# The paper's method: a Gaussian safety critic, no mirror, no correction of the limit, which starts
+# at 15 also where it ends at another one than the default.
+FALLING = (
+    "safetac_point",
+    "safety_critic.kind=gaussian",
+    "optim.mirror=false",
+    "loss.limit_gain=0",
+    "loss.initial_cost_limit=15",
+)
 SAFETAC = (*FALLING, "policy.num_components=1")
 MIXTURE = (*FALLING, "loss.entropic_index=1.2")
 # A limit that falls starves a multiplier, so theirs is the same throughout.

@@ -618,6 +618,12 @@ class TestRecalibration:
         other.load_state_dict(loss.state_dict())
         assert other.scales.equal(loss.scales)
 
+    def test_what_is_not_finite_changes_nothing(self):
+        loss = self.loss()
+        report = loss.recalibrate(self.data([[False, True]] * 2, [0.0, math.nan]))
+        assert report["realised_risk"].isnan()
+        assert loss.scales.tolist() == [1.0, 1.0]
+
     def test_nobody_is_asked(self):
         loss = self.loss()
         assert loss.recalibrate(self.data([[True, True]] * 2, [0.0, 8.0])).is_empty()

@@ -33,12 +33,15 @@ TINY = [
 ]
 
 
+GAUSSIAN = "safety_critic.kind=gaussian"  # whose critics learn in one step with the reward's
+
+
 class Update:
     """One update of SafeTAC, with all that it may change."""
 
     def __init__(self) -> None:
         torch.manual_seed(0)
-        self.trainer = SafeTAC(options=cli.compose("safetac", TINY))
+        self.trainer = SafeTAC(options=cli.compose("safetac", [*TINY, GAUSSIAN]))
         env = self.trainer.make_env(4, seed=0)
         self.critic_optim = self.trainer.build(env)["critic_optim"]
         self.policy = self.trainer.policy

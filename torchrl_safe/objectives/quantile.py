@@ -348,7 +348,8 @@ class QuantileCostLoss(CriticCostLoss):
         Returns:
             TensorDict of scalars: ``predicted_mean``, ``realised_mean``, ``predicted_risk`` and
             ``realised_risk`` of these steps, predictions with the scales as they were before. If
-            all networks learn from all steps, nothing is measured, and it is empty.
+            all networks learn from all steps, nothing is measured, and it is empty. Where one of
+            them is not finite, the scales stay.
 
         Raises:
             KeyError: if an entry is missing.
@@ -376,8 +377,9 @@ class QuantileCostLoss(CriticCostLoss):
             predicted_risk=spectral_risk(predicted, weights).mean(),
             realised_risk=realised_risk(sums, predicted, weights).mean(),
         )
-        measured = torch.tensor(calibration_scales(raw, sums, weights)).to(self.scales)
-        self.scales.lerp_(measured, rate)
+        if all(value.isfinite() for value in report.values()):
+            measured = torch.tensor(calibration_scales(raw, sums, weights)).to(self.scales)
+            self.scales.lerp_(measured, rate)
         return report
 
     def predict(self, tensordict: TensorDictBase, action: Tensor) -> tuple[Tensor, Tensor]:

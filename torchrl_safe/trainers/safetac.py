@@ -214,7 +214,8 @@ class SafeTAC(ConstrainedTrainer):
         optim, limits = self.options.optim, self.limits()
         levels = {name: loss.on_policy_cvar(batch) for name, loss in self.cost_losses.items()}
         for controller, name in zip(self.controllers, limits, strict=False):
-            limits[name] = controller.update(levels[name], limits[name])
+            if levels[name].isfinite():  # if not, the trust region refuses its step
+                limits[name] = controller.update(levels[name], limits[name])
         visited = batch.select(*self.in_keys).flatten()
         order = torch.randperm(len(visited), device=visited.device)
         states = visited[order[: optim.policy_frames]]

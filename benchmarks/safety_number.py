@@ -4,8 +4,8 @@
     python benchmarks/safety_number.py
 
 Measures each run's final policy and critic, and adds a row to
-``benchmarks/results/safety_number/runs.csv``; then prints all rows as a table and draws them into
-``docs/images/safety_number.png``. The layouts are others than
+``benchmarks/results/safety_number/runs.csv``; then writes all rows into ``docs/safety_number.md``
+and draws them into ``docs/images/safety_number.png``. The layouts are others than
 those of training and of the run's evaluations. Predictions are those of the first 100 steps of an
 episode, what followed them is summed over 400 steps more; actions are sampled, as in training.
 
@@ -35,6 +35,8 @@ from torchrl_safe.trainers.commands.evaluate import load
 from torchrl_safe.trainers.saved import from_newest
 from torchrl_safe.trainers.streams import stream_seed
 
+PAGE = Path(__file__).parents[1] / "docs" / "safety_number.md"
+MARK = "<!-- From here on written by benchmarks/safety_number.py. -->"
 PICTURE = Path(__file__).parents[1] / "docs" / "images" / "safety_number.png"
 TABLE = Path(__file__).parent / "results" / "safety_number" / "runs.csv"
 JUDGED, FOLLOWED = 100, 400  # steps
@@ -145,7 +147,8 @@ def draw(rows: Sequence[dict[str, str]]) -> None:
 
 
 def table(rows: Sequence[dict[str, str]]) -> str:
-    """The rows as a table."""
+    """The rows as a table, kinds together."""
+    rows = sorted(rows, key=lambda row: (float(row["limit"]) != 5.0, row["run"]))
     lines = [
         "| " + " | ".join(COLUMNS.values()) + " |",
         "|---" + "|---:" * (len(COLUMNS) - 1) + "|",
@@ -173,7 +176,7 @@ def main() -> None:
             writer.writerow(row)
     with TABLE.open(newline="") as file:
         rows = list(csv.DictReader(file))
-    print(table(rows))
+    PAGE.write_text(PAGE.read_text().partition(MARK)[0] + f"{MARK}\n\n{table(rows)}\n")
     draw(rows)
 
 

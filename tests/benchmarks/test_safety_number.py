@@ -21,7 +21,7 @@ def test_page_is_what_was_measured():
 
 
 def test_order_and_digits():
-    row = {name: "1.23456" for name in safety_number.COLUMNS} | {"limit": "5.0"}
+    row = dict.fromkeys(safety_number.COLUMNS, "1.23456") | {"limit": "5.0"}
     rows = [row | {"run": "b"}, row | {"run": "c", "limit": "2.5"}, row | {"run": "a"}]
     lines = safety_number.table(rows).splitlines()[2:]
     assert [line[2] for line in lines] == ["a", "b", "c"]

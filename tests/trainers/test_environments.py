@@ -246,3 +246,13 @@ def test_state_of_foreign_environments_is_not_taken_for_saved(tmp_path):
     METHODS["trc"](options=make("resume=true", "collector.total_frames=600")).train()
     assert len(curves(run_dir)["update/cost_level"]) == 3
     assert torch.tensor(curves(run_dir)["update/kl"]).isfinite().all()
+
+
+@pytest.mark.parametrize("task", [None, "SafetyPointGoal1", "SafetyHopperVelocity"])
+def test_nobody_says_how_many_threads(task):
+    """The default of a run, which tests of small runs do not have."""
+    options = METHODS["safetac"].Options().changed(**{"env.task": task})
+    assert options.num_threads is None
+    env = make_env(options, 2, seed=0)
+    assert env.batch_size == (2,)
+    env.close()

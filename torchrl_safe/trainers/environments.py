@@ -29,6 +29,7 @@ from torchrl_safe.envs import RANDOMIZATIONS
 from torchrl_safe.envs.tasks import SAFETY_TASKS, get_task
 from torchrl_safe.trainers.options import MethodOptions
 from torchrl_safe.trainers.tasks import RUNNERS
+from torchrl_safe.trainers.threads import most_threads
 
 MakeEnv = Callable[..., EnvBase]
 NOT_INPUTS = ("violation", "violations", "goal_met", "diverged", "step_count")
@@ -124,7 +125,7 @@ def _ours(
     env = options.env
     how = {
         "num_envs": num_envs,
-        "num_threads": options.num_threads,
+        "num_threads": most_threads(options),
         "seed": seed,
         "device": options.device,
         "episode_length": env.episode_length if training else options.eval.num_steps,

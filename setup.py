@@ -17,7 +17,7 @@ NOTE = "The pages and scripts that this one names are in the source distribution
 
 def package_page(readme: str) -> str:
     """The README without what leads into the repository."""
-    page = re.sub(rf"^!\[[^]]*\]\({WITHIN}\)\n+", "", readme, flags=re.MULTILINE)
+    page = re.sub(r"<p .*?</p>\n+", "", readme, flags=re.DOTALL)
     page = re.sub(rf"\[([^]]+)\]\({WITHIN}\)", r"\1", page)
     return page.replace("\n\n", f"\n\n{NOTE}", 1)  # below the title
 

@@ -1,0 +1,80 @@
+"""Figures of README and docs are those of the results that are kept, and lines are short."""
+
+from __future__ import annotations
+
+import re
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+sys.path.append(str(ROOT / "benchmarks"))
+
+import write_pages  # noqa: E402
+
+README = (ROOT / "README.md").read_text()
+CODE = re.compile(r"^( *)```.*?^\1```$", re.MULTILINE | re.DOTALL)
+PART = re.compile(r"<!-- generated: .*?<!-- end -->", re.DOTALL)
+NUMBER = re.compile(r"(?<![\w.])\d[\d,]*(?:\.\d+)*")
+
+
+def shown(markdown):
+    """What a reader sees of Markdown: no comments, no addresses, no tags."""
+    markdown = re.sub(r"<!--.*?-->|<[a-z/][^>]*>", "", markdown, flags=re.DOTALL)
+    return re.sub(r"\]\([^)]*\)", "]", markdown)
+
+
+@pytest.mark.parametrize("page", write_pages.PAGES)
+def test_page_is_what_the_results_say(page):
+    text = (ROOT / page).read_text()
+    assert write_pages.MARKED.search(text)
+    assert write_pages.rewritten(text) == text, "run python benchmarks/write_pages.py"
+
+
+def test_picture_is_of_the_curves_that_are_kept():
+    paths = write_pages.learning_curves()
+    assert len(paths) >= 5
+    assert write_pages.drawn_from(write_pages.LEARNING) == write_pages.digest(paths)
+    assert write_pages.LEARNING.stat().st_size < 100_000
+
+
+class TestReadme:
+    def test_numbers_are_few(self):
+        assert len(NUMBER.findall(shown(README))) <= 40
+
+    def test_no_figure_is_typed(self):
+        assert not NUMBER.findall(shown(CODE.sub("", PART.sub("", README))))
+
+    def test_sentences_are_short(self):
+        prose = re.sub(r"^\|.*$", "", shown(CODE.sub("", README)), flags=re.MULTILINE)
+        for sentence in re.split(r"[.:?;]\s|\n\n|\n\* ", prose):
+            assert len(sentence.split()) <= 30, sentence
+
+    def test_it_is_a_screen_and_a_half(self):
+        assert len(README.splitlines()) <= 120
+        assert max(map(len, README.splitlines())) <= 100
+
+    def test_code_is_short(self):
+        block, environment = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
+        assert len(block.splitlines()) <= 10
+        assert len(environment.splitlines()) <= 5
+
+    def test_table_is_small(self):
+        rows = [line for line in README.splitlines() if line.startswith("|")]
+        assert len(rows) - 2 <= 6
+        assert all(row.count(" to ") == 2 for row in rows[2:])  # intervals
+
+
+class TestStatistics:
+    def test_interval_by_hand(self):
+        # Mean 3, deviation sqrt(2.5), five values; Student's t of four degrees is 2.7764.
+        mean, low, high = write_pages.interval([1, 2, 3, 4, 5])
+        assert mean == 3
+        assert high - mean == pytest.approx(2.7764 * (2.5 / 5) ** 0.5, abs=1e-4)
+        assert mean - low == pytest.approx(high - mean)
+
+    def test_permutation_by_hand(self):
+        # Of six splits of four values, the one seen and its mirror are the furthest apart.
+        assert write_pages.permutation_p([1, 2], [3, 4]) == pytest.approx(2 / 6)
+        assert write_pages.permutation_p([1, 4], [2, 3]) == 1

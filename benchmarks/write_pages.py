@@ -30,7 +30,7 @@ RESULTS = ROOT / "benchmarks" / "results"
 sys.path[:0] = [str(ROOT / "benchmarks" / "paper"), str(ROOT / "benchmarks")]
 from result_tables import PARTS as RESULT_PARTS  # noqa: E402
 
-PAGES = ("README.md",)
+PAGES = ("README.md", "docs/results.md", "docs/safety_number.md")
 MARKED = re.compile(r"(<!-- generated: ([\w ]+) -->\n).*?(\n<!-- end -->)", re.DOTALL)
 WORDS = {5: "five", 6: "six", 7: "seven", 8: "eight", 9: "nine", 10: "ten"}
 LEARNING = ROOT / "docs" / "images" / "learning.png"

@@ -78,3 +78,14 @@ class TestStatistics:
         # Of six splits of four values, the one seen and its mirror are the furthest apart.
         assert write_pages.permutation_p([1, 2], [3, 4]) == pytest.approx(2 / 6)
         assert write_pages.permutation_p([1, 4], [2, 3]) == 1
+
+
+PROSE = [ROOT / "CHANGELOG.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
+
+
+@pytest.mark.parametrize("page", PROSE, ids=lambda page: str(page.relative_to(ROOT)))
+def test_lines_are_short(page):
+    for line in page.read_text().splitlines():
+        table, picture = line.lstrip().startswith("|"), line.startswith("![")
+        breakable = " " in line.strip(" `*>")
+        assert len(line) <= 100 or table or picture or not breakable, line

@@ -28,9 +28,10 @@ from scipy.stats import t as student
 ROOT = Path(__file__).resolve().parents[1]
 RESULTS = ROOT / "benchmarks" / "results"
 sys.path[:0] = [str(ROOT / "benchmarks" / "paper"), str(ROOT / "benchmarks")]
+from experiment_tables import PARTS as EXPERIMENT_PARTS  # noqa: E402
 from result_tables import PARTS as RESULT_PARTS  # noqa: E402
 
-PAGES = ("README.md", "docs/results.md", "docs/safety_number.md")
+PAGES = ("README.md", "docs/results.md", "docs/safety_number.md", "docs/experiments.md")
 MARKED = re.compile(r"(<!-- generated: ([\w ]+) -->\n).*?(\n<!-- end -->)", re.DOTALL)
 WORDS = {5: "five", 6: "six", 7: "seven", 8: "eight", 9: "nine", 10: "ten"}
 LEARNING = ROOT / "docs" / "images" / "learning.png"
@@ -153,6 +154,7 @@ PARTS: dict[str, Callable[[], str]] = {
     "readme speed": readme_speed,
     "safety table": lambda: safety_table(with_p=True),
     **RESULT_PARTS,
+    **EXPERIMENT_PARTS,
 }
 
 

@@ -22,12 +22,12 @@ def prediction_error(run: Path) -> tuple[float, float]:
     """Median relative error of the predicted change, and the least entropy.
 
     Args:
-        run (path): a folder with the ``curves.csv`` of ``benchmarks/keep_run.py``.
+        run (path): the ``curves.csv`` of ``benchmarks/keep_run.py``.
 
     Raises:
         ValueError: if the run has no step of a trust region with a constraint.
     """
-    with (run / "curves.csv").open(newline="") as file:
+    with run.open(newline="") as file:
         rows = [[row.get(name) or "nan" for name in COLUMNS] for row in csv.DictReader(file)]
     numbers = [tuple(map(float, row)) for row in rows]
     errors = [
@@ -46,7 +46,7 @@ def main() -> None:
     parser.add_argument("runs", nargs="+", type=Path)
     print("| run | error of the prediction | least entropy |\n|---|---:|---:|")
     for run in parser.parse_args().runs:
-        error, entropy = prediction_error(run)
+        error, entropy = prediction_error(run / "curves.csv")
         print(f"| {'/'.join(run.parts[-3:])} | {error:.0%} | {entropy:.1f} |")
 
 

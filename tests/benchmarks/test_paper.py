@@ -187,11 +187,11 @@ class TestPredictionError:
     def test_median_of_what_was_logged(self, tmp_path):
         """Errors of 10 %, 50 % and, of the floor .05, 20 %; the first update has no step."""
         self.write(tmp_path, "1,-3,,", "2,-1,1,1.1", "3,-2,-1,-0.5", "4,-1,0.01,0.02")
-        error, entropy = prediction_error.prediction_error(tmp_path)
+        error, entropy = prediction_error.prediction_error(tmp_path / "curves.csv")
         assert error == pytest.approx(0.2)
         assert entropy == -3
 
     def test_run_of_another_method(self, tmp_path):
         self.write(tmp_path, "1,-3,,")
         with pytest.raises(ValueError, match="no trust region's"):
-            prediction_error.prediction_error(tmp_path)
+            prediction_error.prediction_error(tmp_path / "curves.csv")

@@ -31,7 +31,13 @@ sys.path[:0] = [str(ROOT / "benchmarks" / "paper"), str(ROOT / "benchmarks")]
 from experiment_tables import PARTS as EXPERIMENT_PARTS  # noqa: E402
 from result_tables import PARTS as RESULT_PARTS  # noqa: E402
 
-PAGES = ("README.md", "docs/results.md", "docs/safety_number.md", "docs/experiments.md")
+PAGES = (
+    "README.md",
+    "docs/results.md",
+    "docs/safety_number.md",
+    "docs/experiments.md",
+    "docs/blocks/baselines.md",
+)
 MARKED = re.compile(r"(<!-- generated: ([\w ]+) -->\n).*?(\n<!-- end -->)", re.DOTALL)
 WORDS = {5: "five", 6: "six", 7: "seven", 8: "eight", 9: "nine", 10: "ten"}
 LEARNING = ROOT / "docs" / "images" / "learning.png"

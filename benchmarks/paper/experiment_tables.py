@@ -11,7 +11,7 @@ from pathlib import Path
 from statistics import fmean
 
 from prediction_error import prediction_error
-from result_tables import RESULTS, mean, pair, seeds, spread, table
+from result_tables import RESULTS, level, mean, pair, seeds, spread, table
 
 SWEEP = RESULTS / "sweep"
 Curves = list[dict[str, float]]
@@ -87,6 +87,16 @@ MULTIPLIERS = {
     "trc_falling_limit_seed0": "TRC, seed 0",
     "trc_falling_limit_seed1": "TRC, seed 1",
 }
+BASELINES = {
+    "cpo_a": "limit 5 throughout, 100 environments, 20,000 frames, `lmbda` .97, damping .01",
+    "cpo_b": "and damping .1",
+    "cpo_c": "400 environments, `lmbda` .5, damping 1, `max_kl` .01",
+    "cpo_d": "400 environments, 40,000 frames, `lmbda` .9, damping .1",
+    "cpo_e": "and a policy of 64 and 32 units",
+    "cpo_f": "20,000 frames, `lmbda` .9, damping .1, limit 2.5",
+    "sac_lagrangian_fast_multiplier": "limit 5 throughout, `lagrangian.lr=0.2`",
+    "sac_lagrangian_falling_limit_fast_multiplier": "limit falling from 15",
+}
 SOFT = {
     ("5", "`implicit`"): "paper/point/safetac_k5",
     ("5", "`gumbel_softmax`"): "soft_draws/k5",
@@ -143,6 +153,17 @@ def evaluations(names: Mapping[str, str], thousands: Sequence[int]) -> str:
             cells.append(pair(near[-1:]) if near else "")
         rows.append([label, *cells])
     return table(["thousand frames", *(f"{mark:,}" for mark in thousands)], rows)
+
+
+def ends(names: Mapping[str, str]) -> str:
+    """The last evaluation of runs, and the level of their last tenth."""
+    rows = []
+    for name, label in names.items():
+        last = [row for row in curves(SWEEP / f"{name}.csv") if "eval/score" in row][-1]
+        cells = [f"{last['frames']:,.0f}", pair([last]), pair([last], "eval/det/")]
+        rows.append([f"`{name}`", label, *cells, f"{level(SWEEP / f'{name}.csv'):.1f}"])
+    head = ["run", "", "frames", "score / CV, sampled", "deterministic", "level at the end"]
+    return table(head, rows)
 
 
 def finals(folder: Path) -> str:
@@ -228,6 +249,7 @@ PARTS: dict[str, Callable[[], str]] = {
     "log renewals": lambda: evaluations(RENEWALS, (600, 800, 1000)),
     "log multipliers": lambda: evaluations(MULTIPLIERS, (600, 800, 1000)),
     "log lineage": lambda: evaluations(LINEAGE, (600,)),
+    "log baselines": lambda: ends(BASELINES),
     "log point": lambda: finals(RESULTS / "point"),
     "log long": lambda: finals(RESULTS / "long"),
     "log soft draws": soft_draws,

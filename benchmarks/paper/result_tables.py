@@ -97,15 +97,18 @@ def published(robot: str, method: str) -> str:
     return "{:.4g} / {:.3f}".format(*PAPER[robot][method]) if method in PAPER[robot] else "-"
 
 
-def level(folder: Path) -> str:
-    """Limited quantity in the last tenth of training: lowest to highest seed."""
-    levels = []
-    for path in sorted(folder.glob("seed_*/curves.csv")):
-        with path.open(newline="") as file:
-            rows = [row for row in csv.DictReader(file) if row.get("update/constraint")]
-        last = [row for row in rows if int(row["frames"]) > 0.9 * int(rows[-1]["frames"])]
-        levels.append(fmean(float(row["update/constraint"]) for row in last))
-    low, high = f"{min(levels):.1f}", f"{max(levels):.1f}"
+def level(curves: Path) -> float:
+    """The quantity that is limited, in the last tenth of training."""
+    with curves.open(newline="") as file:
+        rows = [row for row in csv.DictReader(file) if row.get("update/constraint")]
+    last = [row for row in rows if int(row["frames"]) > 0.9 * int(rows[-1]["frames"])]
+    return fmean(float(row["update/constraint"]) for row in last)
+
+
+def levels(folder: Path) -> str:
+    """Of a method: lowest to highest seed."""
+    values = [level(path) for path in sorted(folder.glob("seed_*/curves.csv"))]
+    low, high = f"{min(values):.1f}", f"{max(values):.1f}"
     return low if low == high else f"{low} to {high}"
 
 
@@ -124,7 +127,7 @@ def methods(robot: str, names: Mapping[str, str]) -> str:
                 mean(runs, "eval/cv_rate", ".4f"),
                 pair(runs, "eval/det/"),
                 mean(runs, "eval/return", ".1f"),
-                level(folder),
+                levels(folder),
                 mean(runs, "total_cvs", ",.0f"),
                 published(robot, name),
             ]

@@ -9,7 +9,7 @@ and draws them into ``docs/images/safety_number.png``. The layouts are others th
 those of training and of the run's evaluations. Predictions are those of the first 100 steps of an
 episode, what followed them is summed over 400 steps more; actions are sampled, as in training.
 
-``predicted / realised`` is of the mean CVaR, over tenths of the predictions; ``lowest`` and
+``ratio`` is predicted over realised mean CVaR, over tenths of the predictions; ``lowest`` and
 ``highest`` are the tenths that are furthest off. Within a tenth states differ, so that the worst
 eighth of its outcomes costs more than the states' own worst eighths: a critic that is right shows
 .95 to 1.0 here. ``level`` is the mean of ``update/cost_level`` over the last tenth of training.
@@ -44,16 +44,16 @@ COLUMNS = {
     "run": "run",
     "limit": "limit",
     "level": "level",
-    "ratio": "predicted / realised",
+    "ratio": "ratio",
     "lowest": "lowest",
     "highest": "highest",
     "score": "score",
-    "score_det": "deterministic",
-    "cost": "discounted cost",
-    "cv": "CV per step",
-    "p99": "violations, p99",
-    "no_goal": "no goal",
-    "total_cvs": "in training",
+    "score_det": "det.",
+    "cost": "cost",
+    "cv": "CV",
+    "p99": "p99",
+    "no_goal": "rests",
+    "total_cvs": "violations",
 }
 
 
@@ -154,9 +154,14 @@ def table(rows: Sequence[dict[str, str]]) -> str:
         "|---" + "|---:" * (len(COLUMNS) - 1) + "|",
     ]
     for row in rows:
-        cells = [row["run"], *(f"{float(row[name]):.4g}" for name in list(COLUMNS)[1:])]
+        cells = [row["run"], *(number(float(row[name])) for name in list(COLUMNS)[1:])]
         lines.append("| " + " | ".join(cells) + " |")
     return "\n".join(lines)
+
+
+def number(value: float) -> str:
+    """Four digits, and all of a large whole number."""
+    return f"{value:,.0f}" if abs(value) >= 1000 else f"{value:.4g}"
 
 
 def main() -> None:

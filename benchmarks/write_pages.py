@@ -37,6 +37,7 @@ PAGES = (
     "docs/safety_number.md",
     "docs/experiments.md",
     "docs/blocks/baselines.md",
+    "docs/upstream.md",
 )
 MARKED = re.compile(r"(<!-- generated: ([\w ]+) -->\n).*?(\n<!-- end -->)", re.DOTALL)
 WORDS = {5: "five", 6: "six", 7: "seven", 8: "eight", 9: "nine", 10: "ten"}

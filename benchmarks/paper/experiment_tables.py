@@ -1,6 +1,6 @@
-"""The tables of ``docs/experiments.md``, from the curves that are kept.
+"""The tables of ``docs/experiments.md`` and its kin, from the curves that are kept.
 
-``benchmarks/write_pages.py`` puts them into the page.
+``benchmarks/write_pages.py`` puts them into the pages.
 """
 
 from __future__ import annotations
@@ -240,6 +240,25 @@ def distances() -> str:
     return table([*head, "score / CV", "deterministic"], rows)
 
 
+def retrace_sac() -> str:
+    """TorchRL's SAC with either estimator: return of the episodes that ended, seed by seed."""
+    rows = []
+    for first in (1000, 2000, 3000):
+        cells = []
+        for name in ("retrace", "td0"):
+            parts = [
+                [
+                    row["train_return"]
+                    for row in curves(path)
+                    if first < row["frames"] <= first + 1e3
+                ]
+                for path in sorted((RESULTS / "retrace_sac" / name).glob("seed_*.csv"))
+            ]
+            cells.append(", ".join(f"{fmean(part):.1f}" for part in parts))
+        rows.append([f"{first:,} to {first + 1000:,}", *cells])
+    return table(["frames", "Retrace", "TD(0)"], rows)
+
+
 PARTS: dict[str, Callable[[], str]] = {
     "log targets": lambda: windows(TARGETS),
     "log episodes": lambda: windows(EPISODES),
@@ -252,6 +271,7 @@ PARTS: dict[str, Callable[[], str]] = {
     "log baselines": lambda: ends(BASELINES),
     "log point": lambda: finals(RESULTS / "point"),
     "log long": lambda: finals(RESULTS / "long"),
+    "retrace sac": retrace_sac,
     "log soft draws": soft_draws,
     "log distances": distances,
 }

@@ -32,6 +32,12 @@ def test_page_is_what_the_results_say(page):
     assert write_pages.rewritten(text) == text, "run python benchmarks/write_pages.py"
 
 
+def test_every_table_of_the_results_is_generated():
+    typed = PART.sub("", (ROOT / "docs" / "results.md").read_text())
+    assert not re.findall(r"^\|.*", typed, re.MULTILINE)
+    assert not re.findall(r"\d / \.?\d", CODE.sub("", typed))  # a score with its CV
+
+
 def test_picture_is_of_the_curves_that_are_kept():
     paths = write_pages.learning_curves()
     assert len(paths) >= 5
@@ -78,6 +84,13 @@ class TestStatistics:
         # Of six splits of four values, the one seen and its mirror are the furthest apart.
         assert write_pages.permutation_p([1, 2], [3, 4]) == pytest.approx(2 / 6)
         assert write_pages.permutation_p([1, 4], [2, 3]) == 1
+
+
+@pytest.mark.parametrize("words", ["not kept", "dearest", "gave these same", "is paid for"])
+def test_prose_is_plain(words):
+    for page in [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]:
+        prose = CODE.sub("", page.read_text())
+        assert words not in " ".join(prose.split()), page
 
 
 PROSE = [ROOT / "CHANGELOG.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]

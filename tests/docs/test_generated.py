@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import sys
 from pathlib import Path
@@ -11,6 +12,7 @@ import pytest
 ROOT = Path(__file__).parents[2]
 sys.path.append(str(ROOT / "benchmarks"))
 
+import result_tables  # noqa: E402
 import write_pages  # noqa: E402
 
 README = (ROOT / "README.md").read_text()
@@ -70,6 +72,31 @@ class TestReadme:
         rows = [line for line in README.splitlines() if line.startswith("|")]
         assert len(rows) - 2 <= 6
         assert all(row.count(" to ") == 2 for row in rows[2:])  # intervals
+
+
+class TestTables:
+    RUN = {"eval/score": 8.0, "eval/cv_rate": 0.004, "eval/det/score": 7.0, "total_cvs": 1500}
+
+    def test_mean_and_range_of_seeds(self, tmp_path):
+        for seed, score in enumerate((8.0, 10.0)):
+            path = tmp_path / f"seed_{seed}" / "results.json"
+            path.parent.mkdir()
+            path.write_text(json.dumps({**self.RUN, "eval/score": score}))
+        runs = result_tables.seeds(tmp_path)
+        assert result_tables.spread(runs, "eval/score", ".1f") == "9.0 (8.0 to 10.0)"
+        assert result_tables.spread(runs[:1], "eval/score", ".1f") == "8.0"
+        assert result_tables.pair(runs) == "9.0 / 0.0040"
+
+    def test_level_is_of_the_last_tenth(self, tmp_path):
+        lines = [f"{frames},{frames / 10}" for frames in range(10, 101, 10)]
+        path = tmp_path / "curves.csv"
+        path.write_text("\n".join(["frames,update/constraint", *lines, "110,"]))
+        assert result_tables.level(path) == 10  # of frame 100 alone; 110 has no update
+
+    def test_rows_have_as_many_cells_as_the_head(self):
+        for name, part in write_pages.PARTS.items():
+            rows = [line for line in part().splitlines() if line.startswith("|")]
+            assert len({line.count("|") for line in rows}) <= 1, name
 
 
 class TestStatistics:

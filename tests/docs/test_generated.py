@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[2]
-sys.path.append(str(ROOT / "benchmarks"))
+sys.path += [str(ROOT / "benchmarks"), str(ROOT / "benchmarks" / "paper")]
 
 import result_tables  # noqa: E402
 import write_pages  # noqa: E402
@@ -75,13 +75,11 @@ class TestReadme:
 
 
 class TestTables:
-    RUN = {"eval/score": 8.0, "eval/cv_rate": 0.004, "eval/det/score": 7.0, "total_cvs": 1500}
-
     def test_mean_and_range_of_seeds(self, tmp_path):
         for seed, score in enumerate((8.0, 10.0)):
             path = tmp_path / f"seed_{seed}" / "results.json"
             path.parent.mkdir()
-            path.write_text(json.dumps({**self.RUN, "eval/score": score}))
+            path.write_text(json.dumps({"eval/score": score, "eval/cv_rate": 0.004}))
         runs = result_tables.seeds(tmp_path)
         assert result_tables.spread(runs, "eval/score", ".1f") == "9.0 (8.0 to 10.0)"
         assert result_tables.spread(runs[:1], "eval/score", ".1f") == "8.0"

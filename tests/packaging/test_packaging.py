@@ -171,7 +171,7 @@ class TestBuilt:
         for name in [
             "conftest.py",
             "docs/index.md",
-            "docs/images/curves.png",
+            "docs/images/learning.png",
             "examples/safetac_point.py",
             "benchmarks/pytest.ini",
             "CHANGELOG.md",

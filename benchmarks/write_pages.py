@@ -40,20 +40,23 @@ PAGES = (
     "docs/upstream.md",
 )
 MARKED = re.compile(r"(<!-- generated: ([\w ]+) -->\n).*?(\n<!-- end -->)", re.DOTALL)
+LIMIT, FRAMES = 5, 1_000_000
 WORDS = {5: "five", 6: "six", 7: "seven", 8: "eight", 9: "nine", 10: "ten"}
 LEARNING = ROOT / "docs" / "images" / "learning.png"
 
 Row = dict[str, str]
 
 
-def safety_rows(kind: str, limit: float = 5.0) -> list[Row]:
-    """The measured runs on Point with one kind of safety critic."""
+def safety_rows(kind: str) -> list[Row]:
+    """The measured runs on Point with one kind of safety critic: the table's limit and frames."""
     with (RESULTS / "safety_number" / "runs.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
     found = [
         row
         for row in rows
-        if row["run"].startswith(f"point {kind} ") and float(row["limit"]) == limit
+        if row["run"].startswith(f"point {kind} ")
+        and float(row["limit"]) == LIMIT
+        and float(row["frames"]) == FRAMES
     ]
     return sorted(found, key=lambda row: row["run"])
 
@@ -81,7 +84,7 @@ def permutation_p(first: Sequence[float], second: Sequence[float]) -> float:
 QUANTITIES = {
     "score, sampled actions": ("score", ".1f"),
     "violations in training": ("total_cvs", ",.0f"),
-    "CVaR at the end of training, limit 5": ("level", ".2f"),
+    f"CVaR at the end of training, limit {LIMIT}": ("level", ".2f"),
     "predicted / realised CVaR": ("ratio", ".2f"),
 }
 
@@ -113,12 +116,13 @@ def safety_table(with_p: bool) -> str:
 
 def readme_results() -> str:
     """What the table of the README is of."""
-    rows = safety_rows("quantiles")
-    (frames,) = {int(float(row["frames"])) for row in rows}
-    (episodes,) = {int(float(row["episodes"])) for row in rows}
+    runs = [safety_rows(kind) for kind in ("quantiles", "gaussian")]
+    seeds = [WORDS.get(len(rows), str(len(rows))) for rows in runs]
+    counts = f"{seeds[0]} seeds each" if seeds[0] == seeds[1] else f"{' and '.join(seeds)} seeds"
+    episodes = min(int(float(row["episodes"])) for rows in runs for row in rows)
     return wrap(
         "SafeTAC on Point, as it is by default and with the paper's safety critic: "
-        f"{WORDS.get(len(rows), len(rows))} seeds each, {frames:,} frames, {episodes:,} new layouts. "
+        f"{counts}, {FRAMES:,} frames, {episodes:,} new layouts. "
         "Means, with 95 % intervals over seeds."
     )
 
@@ -216,8 +220,8 @@ def draw_learning() -> None:
         axes.set(ylabel=label, ylim=(0, None), xlim=(0, frames[-1] / 1e6))
         axes.grid(alpha=0.25)
         axes.spines[["top", "right"]].set_visible(False)
-    axes.axhline(5.0, color="#D55E00", ls="--", lw=1)
-    axes.text(0.99, 6.5, "limit", color="#D55E00", ha="right")
+    axes.axhline(LIMIT, color="#D55E00", ls="--", lw=1)
+    axes.text(0.99, LIMIT + 1.5, "limit", color="#D55E00", ha="right")
     axes.set_xlabel("million frames")
     figure.savefig(LEARNING, dpi=100, metadata={"Description": digest(learning_curves())})
 

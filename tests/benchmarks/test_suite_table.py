@@ -66,7 +66,7 @@ class TestCells:
 
         capsys.readouterr()
         assert run.main([*tiny, *where, "--dry-run"]) == 0
-        assert capsys.readouterr().out == "1 of 1 cells have a result\n"
+        assert capsys.readouterr().out == "1 of 1 cells have a result\nabout 0 core-hours\n"
         before = path.read_text()
         path.unlink()
         assert run.main([*tiny, *where]) == 0
@@ -78,7 +78,7 @@ class TestCells:
         run_dir = tmp_path / f"runs/{TASK}/tiny/400/seed_0"
         monkeypatch.setitem(run.KNOWN, "tiny", ("cpo", *TINY, "loss.cost_limit=10"))
         with pytest.raises(ValueError, match=r"other options than .*/seed_0: \['loss'\]"):
-            run.keep(run.Cell(TASK, "tiny", 400, 0), run_dir, tmp_path / "results")
+            run.result(run.Cell(TASK, "tiny", 400, 0), run_dir)
 
 
 def made_up(seed=0, task="SafetyPointGoal1", **more):

@@ -16,18 +16,18 @@ from __future__ import annotations
 import argparse
 import json
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, NullLocator
 from numpy.typing import NDArray
-from scipy.stats import trim_mean
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 from keep_run import keep_run
 from run_table import TABLES
+from seed_statistics import iqm, stratified_interval
 
 from torchrl_safe.record import read_metrics
 
@@ -94,37 +94,6 @@ COLUMNS = {
     "return": "eval/return",
     "total CVs": "total_cvs",
 }
-
-
-def iqm(values: np.ndarray) -> float:
-    """Interquartile mean: of the middle half of all runs, whatever their task."""
-    return float(trim_mean(np.ravel(values), 0.25))
-
-
-def stratified_interval(
-    tasks: Sequence[np.ndarray],
-    statistic: Callable[[np.ndarray], float],
-    num_resamples: int = 2_000,
-) -> tuple[float, float]:
-    """95 % bootstrap interval of a statistic of all runs; seeds are resampled within each task.
-
-    Args:
-        tasks (sequence of numpy.ndarray): one value per seed, ``[num_seeds]``, for each task.
-        statistic (callable): of the values of all tasks in one array.
-        num_resamples (int): Defaults to 2,000.
-
-    Returns:
-        tuple of float: lower and upper bound; NaN where no task has two seeds.
-    """
-    if max(map(len, tasks)) < 2:
-        return float("nan"), float("nan")
-    rng = np.random.default_rng(0)
-    draws = [
-        statistic(np.concatenate([rng.choice(values, len(values)) for values in tasks]))
-        for _ in range(num_resamples)
-    ]
-    low, high = np.quantile(draws, [0.025, 0.975])
-    return float(low), float(high)
 
 
 def read_results(root: Path) -> dict[str, list[dict[str, float]]]:

@@ -217,6 +217,8 @@ class Table(Generic[C]):
         known: dict[str, list[float]] = {}
         for path in self.results.rglob("seed_*.json"):
             kept = json.loads(path.read_text())
+            if "seconds" not in kept:  # it diverged
+                continue
             seconds = kept["seconds"] + kept["evaluation_seconds"]
             known.setdefault(kept["command"].split()[2], []).append(kept["frames"] / seconds)
         speeds = recorded_speeds() | {name: statistics.median(all_) for name, all_ in known.items()}

@@ -3,7 +3,7 @@
     python benchmarks/comparison/cell.py tuning 200 cpo env.robot=point seed=1000 run_dir=runs/a
 
 tune.py and final.py start it. Writes ``played.json`` into the run's folder: all episodes, columns
-of rounded numbers.
+of rounded numbers; or, of a training that stopped because its numbers were not finite, why.
 """
 
 from __future__ import annotations
@@ -126,12 +126,18 @@ def main(argv: Sequence[str] | None = None) -> None:
     """Train, and play what is trained."""
     stage, episodes, method, *words = sys.argv[1:] if argv is None else argv
     options = cli.compose(method, words)
-    METHODS[method](options=options).train()
     run_dir = Path(options.folder)
-    if (run_dir / RESULTS).exists():  # it was not stopped on the way
-        draft = run_dir / f"{PLAYED}.draft"
-        draft.write_text(json.dumps(play(options, stage, int(episodes))))
-        draft.replace(run_dir / PLAYED)
+    try:
+        METHODS[method](options=options).train()
+    except FloatingPointError as error:
+        played: dict[str, Any] = {"diverged": str(error)}
+    else:
+        if not (run_dir / RESULTS).exists():  # it was stopped on the way
+            return
+        played = play(options, stage, int(episodes))
+    draft = run_dir / f"{PLAYED}.draft"
+    draft.write_text(json.dumps(played))
+    draft.replace(run_dir / PLAYED)
 
 
 if __name__ == "__main__":

@@ -54,8 +54,17 @@ class Group(NamedTuple):
     results: list[Result]
 
     def values(self, figure: str) -> Array:
-        """A figure, one number per seed."""
-        return np.array([FIGURES[figure](each) for each in self.results])
+        """A figure, one number per seed. A seed that diverged has a score of 0, and no other."""
+        counted = [
+            each for each in self.results if figure.startswith("score") or "diverged" not in each
+        ]
+        return np.array([0.0 if "diverged" in x else FIGURES[figure](x) for x in counted])
+
+    @property
+    def seeds(self) -> str:
+        """How many, and how many of them diverged."""
+        lost = sum("diverged" in each for each in self.results)
+        return f"{len(self.results)}" + (f", {lost} diverged" if lost else "")
 
 
 Place = tuple[str, int, float]  # robot, frames and target
@@ -131,9 +140,10 @@ def section(place: Place, groups: Sequence[Group]) -> Iterator[str]:
     for row, *values in zip(tests, *adjusted, strict=True):
         tests[row] |= dict(zip(("welch", "permutation"), values, strict=True))
     for group in groups:
-        cells = [group.row, f"{group.limit:g}", str(len(group.results))]
+        cells = [group.row, f"{group.limit:g}", group.seeds]
         cells += [mean(group.values(figure)) for figure in FIGURES]
-        if abs(group.values("realised cost").mean() / target - 1) > NEAR:
+        costs = group.values("realised cost")
+        if len(costs) and abs(costs.mean() / target - 1) > NEAR:
             cells[3] += " (*)"
         yield "| " + " | ".join([*cells, robust(group), *shown(tests.get(group.row))]) + " |"
     yield ""
@@ -141,6 +151,8 @@ def section(place: Place, groups: Sequence[Group]) -> Iterator[str]:
 
 def mean(values: Array) -> str:
     """A mean, and its interval if there is one."""
+    if not len(values):
+        return ""
     low, high = interval(values)
     spread = "" if np.isnan(low) else f" ({low:.3g} to {high:.3g})"
     return f"{values.mean():.3g}{spread}"
@@ -216,7 +228,10 @@ def draw(found: Mapping[Place, Sequence[Group]], path: Path) -> None:
 
 def frontier(axes: Axes, groups: Sequence[Group], row: str, style: Mapping[str, Any]) -> None:
     """A row's line through its targets, with bars where there are several seeds."""
-    points = [(group.values("realised cost"), group.values("score")) for group in groups]
+    pairs = [(group.values("realised cost"), group.values("score")) for group in groups]
+    points = [pair for pair in pairs if len(pair[0])]
+    if not points:
+        return
     centres = np.array([[each.mean() for each in pair] for pair in points])
     halves = np.array([[np.ptp(interval(each)) / 2 for each in pair] for pair in points])
     axes.errorbar(

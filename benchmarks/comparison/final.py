@@ -44,10 +44,10 @@ def searched(there: Comparison, row: str) -> list[float]:
         if results is None:
             break
         low, high = min(limits), max(limits)
-        level = {each["options"][LIMIT]: realised(each) for each in results}
-        if min(plan.targets) < min(level.values()):
+        costs = [realised(each) for each in results if "diverged" not in each]
+        if costs and min(plan.targets) < min(costs):
             limits.append(three_digits(low / plan.factor))
-        if max(plan.targets) > max(level.values()):
+        if costs and max(plan.targets) > max(costs):
             limits.append(three_digits(high * plan.factor))
     return limits
 
@@ -87,7 +87,7 @@ def realised_at(there: Comparison, row: str) -> list[tuple[float, float]] | None
     results = there.kept(cells)
     if results is None:
         return None
-    return [(each["options"][LIMIT], realised(each)) for each in results]
+    return [(each["options"][LIMIT], realised(each)) for each in results if "diverged" not in each]
 
 
 def limit_for(points: Sequence[tuple[float, float]], target: float) -> float:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import sys
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
@@ -169,20 +170,24 @@ def training(
 def result(run: Training, run_dir: Path) -> dict[str, Any]:
     """What is kept of a training: all episodes of its evaluation, and a curve without any.
 
+    Of one that diverged: that it did.
+
     Raises:
         ValueError: if the run has other options than the training's command.
     """
+    about = {**dict(zip(run._fields[:6], run[:6], strict=True)), "options": dict(run.options)}
+    played = json.loads((run_dir / cell.PLAYED).read_text())
+    if "diverged" in played:
+        return about | played
     metrics = read_metrics(run_dir / "log")
     frames, levels = metrics.get("update/cost_level", (np.zeros(0), np.zeros(0)))
     late = levels[frames > 0.9 * run.frames]
     at = metrics["train/cost_rate"][0]
     rows = np.unique(np.linspace(0, len(at) - 1, min(POINTS, len(at))).round().astype(int))
-    played = json.loads((run_dir / cell.PLAYED).read_text())
     known = facts(run, run_dir)
     seconds = round(known["evaluation_seconds"] + played["seconds"], 1)
     return {
-        **dict(zip(run._fields[:6], run[:6], strict=True)),
-        "options": dict(run.options),
+        **about,
         **known,
         "evaluation_seconds": seconds,
         "level": round(float(late.mean()), 4) if len(late) else None,
@@ -225,12 +230,14 @@ def merit(kept: Result, target: float) -> float:
     """What trials are ranked by: the score, and less where the realised cost is above the target.
 
     Twice the target's cost halves a score that is above zero, and doubles one below. Costs below
-    the target neither help nor hurt.
+    the target neither help nor hurt. What diverged is worst.
 
     Args:
         kept (mapping): a result.
         target (float): realised mean discounted cost.
     """
+    if "diverged" in kept:
+        return -math.inf
     score = float(column(kept, "score").mean())
     excess = max(1.0, realised(kept) / target)
     return score / excess if score > 0 else score * excess

@@ -83,9 +83,9 @@ def freeze(there: Comparison, row: str, numbers: Sequence[int]) -> None:
     print(f"frozen    {row}: {winner}, {merits[winner]:.3g}", flush=True)
 
 
-def rounded(merits: dict[str, float]) -> dict[str, float]:
-    """To four digits."""
-    return {name: float(f"{value:.4g}") for name, value in merits.items()}
+def rounded(merits: dict[str, float]) -> dict[str, float | None]:
+    """To four digits; JSON has no number for the merit of what diverged."""
+    return {n: float(f"{x:.4g}") if np.isfinite(x) else None for n, x in merits.items()}
 
 
 def main(argv: Sequence[str] | None = None) -> int:

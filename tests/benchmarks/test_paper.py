@@ -49,48 +49,6 @@ class TestCells:
         assert "finished  point/safetac_k3" in capfd.readouterr().out
 
 
-class TestStatistics:
-    def test_iqm(self):
-        assert make_table.iqm(np.array([-100.0, 1.0, 2.0, 100.0])) == 1.5
-
-    @pytest.mark.parametrize(
-        ("shape", "expected"),
-        [
-            ((5, 4), (2.82631519, 2.48603393, 3.16570731)),
-            ((3, 1), (3.19091138, 2.33480533, 4.36646347)),
-            ((10, 6), (3.17447445, 2.92109017, 3.4581457)),
-        ],
-    )
-    def test_rliable(self, shape, expected):
-        """rliable 1.2.0 on the same numbers; it cannot be imported with pandas 3."""
-        generator = np.random.default_rng(0)
-        for size in ((5, 4), (3, 1), (10, 6)):  # drawn one after the other
-            values = generator.normal(3, 1, size)
-            if size == shape:
-                break
-        low, high = make_table.stratified_interval(list(values.T), make_table.iqm, 20_000)
-        assert make_table.iqm(values) == pytest.approx(expected[0], abs=1e-7)
-        assert (low, high) == pytest.approx(expected[1:], abs=0.02)
-
-    def test_interval_covers_the_mean(self):
-        """Of 200 samples of a known mean, about 95 % of the intervals hold it."""
-        rng = np.random.default_rng(1)
-        samples = rng.normal(3.0, 1.0, (200, 2, 20))
-        hits = 0
-        for tasks in samples:
-            low, high = make_table.stratified_interval(tasks, np.mean, num_resamples=200)
-            hits += low <= 3.0 <= high
-        assert 0.88 <= hits / 200 <= 0.99
-
-    def test_strata_are_kept(self):
-        """Seeds that agree within their task leave nothing to chance, however tasks differ."""
-        low, high = make_table.stratified_interval([np.zeros(3), np.ones(3)], np.mean)
-        assert low == high == 0.5
-
-    def test_one_seed_has_no_interval(self):
-        assert np.isnan(make_table.stratified_interval([np.ones(1)], make_table.iqm)).all()
-
-
 def test_table():
     run = dict.fromkeys(make_table.COLUMNS.values(), 2.0)
     results = {"cpo": [{**run, "frames": 1000}, {**run, "frames": 900}]}

@@ -8,7 +8,6 @@ import textwrap
 from pathlib import Path
 
 import drive_original
-import numpy as np
 import pytest
 import run
 import small
@@ -107,12 +106,6 @@ def made_up(seed=0, task="SafetyPointGoal1", **more):
 
 
 class TestTable:
-    def test_interval_is_students(self):
-        """Of Student's own sleep data, first drug; R's t.test gives these bounds."""
-        extra = np.array([0.7, -1.6, -0.2, -1.2, -0.1, 3.4, 3.7, 0.8, 0.0, 2.0])
-        assert table.interval(extra) == pytest.approx((-0.5297804, 2.0297804), abs=1e-6)
-        assert np.isnan(table.interval(extra[:1])).all()
-
     def test_mark_needs_reward_and_cost_at_once(self):
         assert table.time_to(made_up(), 20.0) == (180.0, 30)
         assert table.time_to(made_up(), 26.0) is None

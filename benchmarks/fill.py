@@ -93,7 +93,7 @@ def facts(cell: Cell, run_dir: Path) -> dict[str, Any]:
     settings = read_config(run_dir / CONFIG)
     method, *overrides = cell.words
     wanted = cli.compose(method, overrides).settings()
-    other = [name for name in wanted.keys() - OF_A_RUN if wanted[name] != settings[name]]
+    other = [name for name in wanted.keys() - OF_A_RUN if wanted[name] != settings.get(name)]
     if other:
         raise ValueError(f"{run_dir} is a run of other options than {cell.path}: {other}.")
     metrics = read_metrics(run_dir / "log")
@@ -192,20 +192,28 @@ class Table(Generic[C]):
             with launches_of(job.run_dir).open("a") as file:
                 file.write(json.dumps({"time": now, "commit": commit(), **how}) + "\n")
 
+        refused = []
+
         def keep(job: Job) -> None:
             cell = todo[job]
-            path = write(self.file(cell), self.result(cell, job.run_dir))
-            print(f"kept      {path}", flush=True)
+            try:
+                path = write(self.file(cell), self.result(cell, job.run_dir))
+            except ValueError as error:  # the others go on
+                print(f"refused   {error}", flush=True)
+                refused.append(job)
+            else:
+                print(f"kept      {path}", flush=True)
 
         if self.here is None:
-            return run_jobs(list(todo), jobs, threads, remember, keep)
+            failed = run_jobs(list(todo), jobs, threads, remember, keep)
+            return failed + len(refused)
         for job in todo:
             if not job.finished:
                 job.run_dir.parent.mkdir(parents=True, exist_ok=True)
                 remember(job)
                 self.here(job.line())
             keep(job)
-        return 0
+        return len(refused)
 
     def core_hours(self, trainings: Iterable[tuple[str, int]]) -> float:
         """What trainings will cost, at the median speed of what is kept of the same method.

@@ -3,12 +3,15 @@
     python benchmarks/comparison/cell.py tuning 200 cpo env.robot=point seed=1000 run_dir=runs/a
 
 tune.py and final.py start it. Writes ``played.json`` into the run's folder: all episodes, columns
-of rounded numbers; or, of a training that stopped because its numbers were not finite, why.
+of rounded numbers; or, of a training that stopped because its numbers were not finite, why. Of its
+checkpoints, whose replay takes hundreds of megabytes, only the policy is left.
 """
 
 from __future__ import annotations
 
 import json
+import shlex
+import shutil
 import sys
 import time
 from collections.abc import Sequence
@@ -26,9 +29,11 @@ from torchrl_safe.trainers import METHODS, cli, load_policy
 from torchrl_safe.trainers.environments import make_env
 from torchrl_safe.trainers.run import cost_gamma
 from torchrl_safe.trainers.saved import RESULTS
+from torchrl_safe.trainers.saved_policies import Policy, SavedPolicy, write_policy
 from torchrl_safe.trainers.streams import stream_seed
 
 PLAYED = "played.json"
+POLICY = "policy.safetensors"
 KINDS = {"sampled": ExplorationType.RANDOM, "deterministic": ExplorationType.DETERMINISTIC}
 STARTS = (0.0, 0.25, 0.5)  # of an episode: where discounted costs are counted from
 
@@ -77,11 +82,12 @@ def outcomes(costs: Tensor, running: Tensor, gamma: float) -> list[list[float | 
     return rows
 
 
-def play(options: Any, stage: str, episodes: int) -> dict[str, Any]:
+def play(options: Any, policy: Policy, stage: str, episodes: int) -> dict[str, Any]:
     """Play a trained policy on layouts that no training and no other stage saw.
 
     Args:
         options (MethodOptions): the run's.
+        policy (callable): what it learned.
         stage (str): whose layouts: the same for all methods and seeds.
         episodes (int): how many, with sampled and with deterministic actions.
 
@@ -92,7 +98,6 @@ def play(options: Any, stage: str, episodes: int) -> dict[str, Any]:
     """
     begun = time.perf_counter()
     seed = stream_seed(f"comparison {stage}")
-    policy = load_policy(options.folder)
     gamma = cost_gamma(options)
     kept: dict[str, Any] = {}
     for kind, exploration in KINDS.items():
@@ -134,10 +139,14 @@ def main(argv: Sequence[str] | None = None) -> None:
     else:
         if not (run_dir / RESULTS).exists():  # it was stopped on the way
             return
-        played = play(options, stage, int(episodes))
+        policy = load_policy(run_dir)
+        about = {"command": shlex.join(["torchrl-safe", "train", method, *words])}
+        write_policy(run_dir / POLICY, SavedPolicy(policy, options, about))
+        played = play(options, policy, stage, int(episodes))
     draft = run_dir / f"{PLAYED}.draft"
     draft.write_text(json.dumps(played))
     draft.replace(run_dir / PLAYED)
+    shutil.rmtree(run_dir / "checkpoints", ignore_errors=True)
 
 
 if __name__ == "__main__":

@@ -167,11 +167,15 @@ def main(argv: Sequence[str] | None = None) -> int:
     done = {row: limits for row in rows if (limits := settle(there, row)) is not None}
     failed += there.fill([cell for row in done for cell in finals(there, row, done[row])])
     if there.args.dry_run:
-        each = len(plan.targets) * len(plan.final_seeds)
         frames = there.args.frames or plan.frames
-        there.estimate(
-            [(ROWS[row].method, frames) for row in rows if row not in done] * each, "final ones"
-        )
+        later = []
+        for row in there.args.methods:
+            method = ROWS[row].method
+            if row not in rows:
+                later += [(method, plan.frames)] * len(plan.multiples)
+            if row not in done:
+                later += [(method, frames)] * (len(plan.targets) * len(plan.final_seeds))
+        there.estimate(later, "of search and comparison")
     return failed
 
 

@@ -26,6 +26,7 @@ from torchrl_safe.envs import SafeRobotEnv
 from torchrl_safe.record import evaluate
 from torchrl_safe.trainers import METHODS, cli
 from torchrl_safe.trainers.options import Options, flat
+from torchrl_safe.trainers.saved_policies import read_policy
 
 
 class TestSpaces:
@@ -333,3 +334,6 @@ class TestChain:
         subprocess.run(line, check=True, capture_output=True)
         played = json.loads((tmp_path / "run" / cell.PLAYED).read_text())
         assert [len(each["return"]) for each in played["episodes"].values()] == [3, 3]
+        # Without its replay, which would fill the disk, and with its policy.
+        assert sum(path.stat().st_size for path in (tmp_path / "run").rglob("*")) < 1_000_000
+        assert read_policy(tmp_path / "run" / cell.POLICY).options.method == "cpo"

@@ -92,6 +92,8 @@ FIGURES: dict[str, Callable[[Result], float]] = {
     "in training": lambda kept: float(kept["training_violations"]),
 }
 
+SPREAD = {"realised cost", "realised CVaR", "score"}  # figures that are shown with intervals
+
 
 def read(results: Path) -> dict[Place, list[Group]]:
     """All groups that have a seed, by where they are compared; rows in the order of freezing."""
@@ -129,19 +131,27 @@ def section(place: Place, groups: Sequence[Group]) -> Iterator[str]:
     """The table of a target, best score first."""
     robot, frames, target = place
     yield f"## {robot.capitalize()}, {frames:,} frames, realised cost {target:g}\n"
-    head = ["method", "limit", "seeds", *FIGURES, "IQM of scores", f"{OURS} above it", "p, Welch"]
+    head = [
+        "method",
+        "limit",
+        "seeds",
+        *FIGURES,
+        "IQM of scores",
+        f"{OURS} above it",
+        "p, Welch (Holm)",
+    ]
     head.append("p, permutation")
     yield "| " + " | ".join(head) + " |"
     yield "|---" + "|---:" * (len(head) - 1) + "|"
     groups = sorted(groups, key=lambda group: -group.values("score").mean())
     ours = next((group for group in groups if group.row == OURS), None)
     tests = {group.row: tested(ours, group) for group in groups if ours not in (None, group)}
-    adjusted = [holm([each[kind] for each in tests.values()]) for kind in ("welch", "permutation")]
-    for row, *values in zip(tests, *adjusted, strict=True):
-        tests[row] |= dict(zip(("welch", "permutation"), values, strict=True))
+    adjusted = holm([each["welch"] for each in tests.values()])
+    for row, p in zip(tests, adjusted, strict=True):
+        tests[row]["welch"] = p
     for group in groups:
         cells = [group.row, f"{group.limit:g}", group.seeds]
-        cells += [mean(group.values(figure)) for figure in FIGURES]
+        cells += [mean(group.values(figure), figure in SPREAD) for figure in FIGURES]
         costs = group.values("realised cost")
         if len(costs) and abs(costs.mean() / target - 1) > NEAR:
             cells[3] += " (*)"
@@ -149,13 +159,13 @@ def section(place: Place, groups: Sequence[Group]) -> Iterator[str]:
     yield ""
 
 
-def mean(values: Array) -> str:
-    """A mean, and its interval if there is one."""
+def mean(values: Array, spread: bool) -> str:
+    """A mean, and its interval if that is wanted and there is one."""
     if not len(values):
         return ""
     low, high = interval(values)
-    spread = "" if np.isnan(low) else f" ({low:.3g} to {high:.3g})"
-    return f"{values.mean():.3g}{spread}"
+    between = f" ({low:.3g} to {high:.3g})" if spread and not np.isnan(low) else ""
+    return f"{values.mean():.4g}{between}"
 
 
 def robust(group: Group) -> str:
@@ -216,7 +226,9 @@ def draw(found: Mapping[Place, Sequence[Group]], path: Path) -> None:
         left.axvline(target, color="#999999", lw=0.8, ls=":")
     left.set(xlabel="realised mean discounted cost", ylabel="score")
     left.set_title(f"{robot.capitalize()}, {frames:,} frames, new layouts", fontsize=10)
-    left.legend(fontsize=7, ncols=2)
+    figure.legend(
+        *left.get_legend_handles_labels(), loc="outside lower center", ncols=8, fontsize=7
+    )
     right.set(xlabel="score", ylabel="share of seeds above it", ylim=(0, 1.02))
     right.set_title(f"realised cost {middle:g}", fontsize=10)
     for axes in (left, right):

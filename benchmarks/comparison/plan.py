@@ -321,4 +321,7 @@ def arguments(about: str | None, argv: Sequence[str] | None, *more: Any) -> argp
         parser.add_argument(name, **how)
     parser.add_argument("--smoke", action="store_true", help="tiny trainings, in this process")
     add_arguments(parser, RESULTS, ROOT / "runs" / "comparison")
-    return parser.parse_args(argv)
+    args = parser.parse_args(argv)
+    if args.smoke and RESULTS in (args.results, *args.results.parents):
+        parser.error("--smoke needs --results elsewhere: its figures are none")
+    return args

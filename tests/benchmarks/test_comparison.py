@@ -220,17 +220,21 @@ class TestCompare:
         # Scores of 10 to 14: 12, give or take 2.776 of a standard error of .707.
         assert ours["score"] == "12 (10 to 14)"
         assert ours["IQM of scores"].startswith("12 (")
-        assert ours["p, Welch"] == ours["safetac above it"] == ""
+        assert ours["p, Welch (Holm)"] == ours["safetac above it"] == ""
         assert cpo["realised cost"] == "4 (4 to 4) (*)"
         assert cpo["realised CVaR"] == "6 (6 to 6)"  # the worst of two outcomes
         assert cpo["safetac above it"] == "1 (1 to 1)"
         assert cpo["p, permutation"] == "0.0079"
-        assert cpo["in training"] == "7 (7 to 7)"
+        assert cpo["in training"] == "7"
 
     def test_p_values_are_of_all_rows_together(self):
-        third = compare.Group("trc", 3.0, self.groups()[1].results)
-        _, *others = self.rows(self.groups(third))
-        assert [row["p, permutation"] for row in others] == ["0.016", "0.016"]
+        """Of two rows alike Holm's first factor is two, and the second p is not below the first."""
+        name = "p, Welch (Holm)"
+        (_, alone), groups = self.rows(self.groups()), self.groups()
+        _, *others = self.rows([*groups, compare.Group("trc", 3.0, groups[1].results)])
+        for row in others:
+            assert float(row[name]) == pytest.approx(2 * float(alone[name]), rel=0.05)
+            assert row["p, permutation"] == "0.0079"
 
     def test_what_diverged_counts_as_nothing(self):
         seeds = [*self.groups()[1].results[:4], {"diverged": "it did"}]
@@ -301,6 +305,11 @@ class TestChain:
         assert tune.main(words) == final.main(words) == 0
         assert "kept" not in capsys.readouterr().out
         assert before == {p: p.read_bytes() for p in (tmp_path / "results").rglob("*.json")}
+
+    def test_tiny_trainings_are_no_results(self, capsys):
+        with pytest.raises(SystemExit):
+            tune.main(["--smoke"])
+        assert "--smoke needs --results elsewhere" in capsys.readouterr().err
 
     def test_a_frozen_entry_stays(self, tmp_path):
         where = {"results": tmp_path, "runs": tmp_path, "threads": 1, "smoke": True}

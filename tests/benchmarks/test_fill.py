@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 import json
+import os
+import signal
+import sys
+import threading
 from pathlib import Path
 from typing import NamedTuple
 
 import fill
 import numpy as np
 import pytest
+from side_by_side import Job, run_jobs
 
 
 class Cell(NamedTuple):
@@ -97,3 +102,17 @@ def test_evaluations_are_no_part_of_learning():
     learning, evaluating = fill.learning_seconds(metrics)
     assert learning.tolist() == [1.0, 2.0, 3.0]
     assert evaluating == 3.0
+
+
+def test_a_stop_reaches_what_runs_and_begins_nothing_more(tmp_path):
+    wait = (sys.executable, "-c", "import time; time.sleep(60)")
+    jobs = [Job(name, tmp_path / name, wait) for name in ("a", "b")]
+    begun = []
+
+    def before(job):
+        begun.append(job.name)
+        threading.Timer(1.0, os.kill, (os.getpid(), signal.SIGINT)).start()
+
+    with pytest.raises(SystemExit, match="the same command goes on"):
+        run_jobs(jobs, at_once=1, before=before)
+    assert begun == ["a"]

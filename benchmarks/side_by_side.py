@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import signal
 import subprocess
+import sys
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -12,16 +13,24 @@ from typing import NamedTuple
 
 
 class Job(NamedTuple):
-    """A training: how it is called, its folder, and what runs it or goes on with it."""
+    """A training: how it is called, its folder, and what runs it or goes on with it.
+
+    Attributes:
+        name: of messages.
+        run_dir: its folder.
+        command: what starts it.
+        product: the file in the folder that is there when it is finished.
+    """
 
     name: str
     run_dir: Path
     command: tuple[str, ...]
+    product: str = "results.json"
 
     @property
     def finished(self) -> bool:
-        """Whether its results are there."""
-        return (self.run_dir / "results.json").exists()
+        """Whether its product is there."""
+        return (self.run_dir / self.product).exists()
 
     def line(self) -> list[str]:
         """What is to be started; one that was stopped before its first checkpoint begins again."""
@@ -38,7 +47,7 @@ def run_jobs(
 ) -> int:
     """Run those that are not finished; the number of those that failed.
 
-    What a job prints goes to ``<run_dir>.log``. The first Ctrl-C or SIGTERM reaches each as one.
+    What a job prints goes to ``<run_dir>.log``. A Ctrl-C or SIGTERM reaches each as a Ctrl-C.
 
     Args:
         jobs (sequence of Job): in this order.
@@ -46,6 +55,9 @@ def run_jobs(
         threads (int): of each, as OpenMP is told; ``num_threads`` is the command's.
         before (callable, optional): is told what is about to start.
         after (callable, optional): is told what is finished, also where it was already.
+
+    Raises:
+        SystemExit: after a Ctrl-C or SIGTERM, when all have saved and ended.
     """
     running: set[subprocess.Popen[bytes]] = set()
     stopping = False
@@ -83,7 +95,10 @@ def run_jobs(
     previous = {number: signal.signal(number, stop) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
         with ThreadPoolExecutor(at_once) as pool:
-            return sum(pool.map(run, jobs))
+            failed = sum(pool.map(run, jobs))
+        if stopping:
+            sys.exit("stopped; the same command goes on")
+        return failed
     finally:
         for number, handler in previous.items():
             signal.signal(number, handler)

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import csv
 import hashlib
-import itertools
 import json
 import re
 import statistics
@@ -23,13 +22,13 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 from PIL import Image
-from scipy.stats import t as student
 
 ROOT = Path(__file__).resolve().parents[1]
 RESULTS = ROOT / "benchmarks" / "results"
 sys.path[:0] = [str(ROOT / "benchmarks" / "paper"), str(ROOT / "benchmarks")]
 from experiment_tables import PARTS as EXPERIMENT_PARTS  # noqa: E402
 from result_tables import PARTS as RESULT_PARTS  # noqa: E402
+from seed_statistics import interval, permutation  # noqa: E402
 
 PAGES = (
     "README.md",
@@ -61,26 +60,6 @@ def safety_rows(kind: str) -> list[Row]:
     return sorted(found, key=lambda row: row["run"])
 
 
-def interval(values: Sequence[float]) -> tuple[float, float, float]:
-    """Mean, and its 95 % interval over seeds by Student's t."""
-    mean = statistics.fmean(values)
-    width = student.ppf(0.975, len(values) - 1) * statistics.stdev(values) / len(values) ** 0.5
-    return mean, mean - width, mean + width
-
-
-def permutation_p(first: Sequence[float], second: Sequence[float]) -> float:
-    """Two-sided p of an exact permutation test of equal means."""
-    pooled = [*first, *second]
-    total, size = sum(pooled), len(first)
-
-    def difference(part: float) -> float:
-        return abs(part / size - (total - part) / (len(pooled) - size))
-
-    seen = difference(sum(first)) * (1 - 1e-12)
-    splits = [difference(sum(part)) for part in itertools.combinations(pooled, size)]
-    return statistics.fmean(value >= seen for value in splits)
-
-
 QUANTITIES = {
     "score, sampled actions": ("score", ".1f"),
     "violations in training": ("total_cvs", ",.0f"),
@@ -91,8 +70,8 @@ QUANTITIES = {
 
 def with_interval(values: Sequence[float], digits: str) -> str:
     """``14.7 (12.4 to 17.0)``."""
-    mean, low, high = interval(values)
-    return f"{mean:{digits}} ({low:{digits}} to {high:{digits}})"
+    low, high = interval(np.array(values))
+    return f"{statistics.fmean(values):{digits}} ({low:{digits}} to {high:{digits}})"
 
 
 def safety_table(with_p: bool) -> str:
@@ -109,7 +88,7 @@ def safety_table(with_p: bool) -> str:
         values = [[float(row[name]) for row in rows] for rows in critics]
         cells = [with_interval(column, digits) for column in values]
         if with_p:
-            cells.append(f"{permutation_p(*values):.3f}")
+            cells.append(f"{permutation(*map(np.array, values)):.3f}")
         lines.append(f"| {label} | {' | '.join(cells)} |")
     return "\n".join(lines)
 

@@ -15,31 +15,22 @@ Run it on a quiet machine: a result says how long it took.
 from __future__ import annotations
 
 import argparse
-import importlib.metadata
 import json
-import os
-import platform
-import shlex
-import subprocess
 import sys
-import time
 from collections.abc import Iterable, Sequence
 from itertools import product
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-import torch
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
-from side_by_side import Job, run_jobs
+from fill import ROOT, Table, add_arguments, facts, learning_seconds
 
 from torchrl_safe.record import read_metrics
-from torchrl_safe.trainers import METHODS, cli
-from torchrl_safe.trainers.saved import CONFIG, read_config
+from torchrl_safe.trainers import METHODS
 from torchrl_safe.trainers.tasks import NAMES, RUNNERS, follows
 
-ROOT = Path(__file__).parents[2]
 RESULTS = ROOT / "benchmarks" / "results" / "suite"
 
 VARIANTS: dict[str, tuple[str, ...]] = {
@@ -51,7 +42,6 @@ VARIANTS: dict[str, tuple[str, ...]] = {
 KNOWN = {**{name: (name,) for name in METHODS}, **VARIANTS}
 NAMED = [name for name in NAMES if follows(name)]
 
-OF_A_RUN = {"run_dir", "resume", "num_threads"}  # and not of what it shows
 EVALUATIONS = 20  # during training: where a mark is reached is known to a twentieth of the run
 KINDS = {"deterministic": "eval/det/", "sampled": "eval/"}
 
@@ -104,37 +94,6 @@ PLAN = [
 """What the table is to show; cells beyond it are added by --tasks."""
 
 
-def machine() -> dict[str, Any]:
-    """What the cells are run on."""
-    info = Path("/proc/cpuinfo")
-    lines = info.read_text().splitlines() if info.exists() else []
-    models = {line.partition(":")[2].strip() for line in lines if line.startswith("model name")}
-    gpus = [torch.cuda.get_device_name(i) for i in range(torch.cuda.device_count())]
-    return {
-        "cpu": ", ".join(sorted(models)) or platform.processor() or platform.machine(),
-        "cores": len(os.sched_getaffinity(0)),
-        "gpu": gpus,
-        "system": platform.system(),
-        "python": platform.python_version(),
-        **{name: importlib.metadata.version(name) for name in ("torch", "torchrl", "mujoco")},
-    }
-
-
-def commit() -> str:
-    """The commit of the library, and whether somebody has changed it since."""
-
-    def git(*words: str) -> str:
-        line = ["git", "-C", str(ROOT), *words]
-        return subprocess.run(line, capture_output=True, text=True, check=True).stdout.strip()
-
-    return git("rev-parse", "HEAD") + ("-dirty" if git("status", "-s", "torchrl_safe") else "")
-
-
-def launches_of(run_dir: Path) -> Path:
-    """The file that remembers each start of a run: when, on what, of which commit."""
-    return run_dir.with_name(f"{run_dir.name}.launches.jsonl")
-
-
 def result(cell: Cell, run_dir: Path) -> dict[str, Any]:
     """What is kept of a finished run: no mean without the episodes that it is of.
 
@@ -142,29 +101,13 @@ def result(cell: Cell, run_dir: Path) -> dict[str, Any]:
         ValueError: if the run has other options than the cell's command.
     """
     metrics = read_metrics(run_dir / "log")
-    settings = read_config(run_dir / CONFIG)
-    method, *overrides = cell.words
-    wanted = cli.compose(method, overrides).settings()
-    other = [name for name in wanted.keys() - OF_A_RUN if wanted[name] != settings[name]]
-    if other:
-        raise ValueError(f"{run_dir} is a run of other options than {cell.path}: {other}.")
     finished = json.loads((run_dir / "results.json").read_text())
-    launches = [json.loads(line) for line in launches_of(run_dir).read_text().splitlines()]
-    at, seconds = metrics["time/seconds"]
-    evaluated, evaluations = metrics.get("time/eval", (at[:0], seconds[:0]))
-    # Evaluations are no part of learning. Each belongs to the update that it came after.
-    spent = np.zeros(len(at))
-    spent[np.searchsorted(at, evaluated)] = evaluations
-    learning = seconds - np.cumsum(spent)
+    learning, _ = learning_seconds(metrics)
     points = metrics["eval/return"][0]
-    rows = np.searchsorted(at, points)
+    rows = np.searchsorted(metrics["time/seconds"][0], points)
     return {
         **cell._asdict(),
-        "command": shlex.join(["torchrl-safe", "train", *cell.words]),
-        "launches": launches,
-        "seconds": round(float(learning[-1]), 1),
-        "evaluation_seconds": round(float(spent.sum()), 1),
-        "training_violations": finished["total_cvs"],
+        **facts(cell, run_dir),
         "episodes": {
             kind: {
                 name: [round(episode[name], 3) for episode in finished["episodes"][prefix]]
@@ -186,14 +129,12 @@ def result(cell: Cell, run_dir: Path) -> dict[str, Any]:
     }
 
 
-def keep(cell: Cell, run_dir: Path, results: Path) -> Path:
-    """Write the result of a finished run."""
-    path = results / cell.path.with_suffix(".json")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    # A line for each entry: a change of one cell is a change of few lines.
-    lines = [f"  {json.dumps(name)}: {json.dumps(x)}" for name, x in result(cell, run_dir).items()]
-    path.write_text("{\n" + ",\n".join(lines) + "\n}\n")
-    return path
+def table_of(results: Path, runs: Path, threads: int = 1) -> Table[Cell]:
+    """How the table's cells are run and kept."""
+    train = [sys.executable, "-m", "torchrl_safe.trainers.cli", "train"]
+    return Table(
+        results, runs, lambda cell: [*train, *cell.words, f"num_threads={threads}"], result
+    )
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -203,43 +144,13 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--methods", nargs="+", choices=KNOWN, default=["safetac"])
     parser.add_argument("--frames", nargs="+", type=int, default=[1_000_000])
     parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2])
-    parser.add_argument("--jobs", type=int, default=1, help="cells at a time")
-    parser.add_argument("--threads", type=int, default=1, help="of each cell")
-    parser.add_argument("--runs", type=Path, default=ROOT / "runs" / "suite")
-    parser.add_argument("--results", type=Path, default=RESULTS)
-    parser.add_argument("--dry-run", action="store_true", help="print the commands")
+    add_arguments(parser, RESULTS, ROOT / "runs" / "suite")
     args = parser.parse_args(argv)
     wanted = PLAN
     if args.tasks is not None:
         wanted = cells(args.tasks, args.methods, args.frames, args.seeds)
-    missing = [
-        cell for cell in wanted if not (args.results / cell.path.with_suffix(".json")).exists()
-    ]
-    print(f"{len(wanted) - len(missing)} of {len(wanted)} cells have a result")
-    train = [sys.executable, "-m", "torchrl_safe.trainers.cli", "train"]
-    jobs = {
-        Job(
-            str(cell.path),
-            args.runs / cell.path,
-            (*train, *cell.words, f"num_threads={args.threads}"),
-        ): cell
-        for cell in missing
-    }
-    if args.dry_run:
-        for job in jobs:
-            print(shlex.join(job.line()))
-        return 0
-    how = {**machine(), "threads": args.threads, "jobs": args.jobs}
-
-    def remember(job: Job) -> None:
-        now = time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime())
-        with launches_of(job.run_dir).open("a") as file:
-            file.write(json.dumps({"time": now, "commit": commit(), **how}) + "\n")
-
-    def finish(job: Job) -> None:
-        print(f"kept      {keep(jobs[job], job.run_dir, args.results)}", flush=True)
-
-    return run_jobs(list(jobs), args.jobs, args.threads, remember, finish)
+    table = table_of(args.results, args.runs, args.threads)
+    return table.fill(wanted, args.jobs, args.threads, args.dry_run)
 
 
 if __name__ == "__main__":

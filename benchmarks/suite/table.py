@@ -19,10 +19,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import t as student
 
-sys.path.insert(0, str(Path(__file__).parent))
-from run import KINDS, NAMED, RESULTS, ROOT
+sys.path.insert(0, str(Path(__file__).parents[1]))
+from fill import ROOT
+from run import KINDS, NAMED, RESULTS
+from seed_statistics import interval
 
 from torchrl_safe.record import proportion_interval
 from torchrl_safe.trainers.tasks import COST_LIMIT
@@ -82,14 +83,6 @@ def read_results(root: Path = RESULTS) -> list[Result]:
     results = [json.loads(path.read_text()) for path in root.rglob("seed_*.json")]
     order = {name: number for number, name in enumerate(NAMED)}
     return sorted(results, key=lambda r: (order[r["task"]], r["frames"], r["method"], r["seed"]))
-
-
-def interval(values: Array) -> tuple[float, float]:
-    """95 % interval of the mean of seeds, Student's t; NaN of a single one."""
-    if len(values) < 2:
-        return float("nan"), float("nan")
-    half = student.ppf(0.975, len(values) - 1) * values.std(ddof=1) / np.sqrt(len(values))
-    return float(values.mean() - half), float(values.mean() + half)
 
 
 def time_to(result: Result, reward: float, kind: str = "sampled") -> tuple[float, int] | None:

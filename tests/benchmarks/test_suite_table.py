@@ -8,7 +8,6 @@ import textwrap
 from pathlib import Path
 
 import drive_original
-import numpy as np
 import pytest
 import run
 import small
@@ -66,7 +65,7 @@ class TestCells:
 
         capsys.readouterr()
         assert run.main([*tiny, *where, "--dry-run"]) == 0
-        assert capsys.readouterr().out == "1 of 1 cells have a result\n"
+        assert capsys.readouterr().out == "1 of 1 cells have a result\nabout 0 core-hours\n"
         before = path.read_text()
         path.unlink()
         assert run.main([*tiny, *where]) == 0
@@ -78,7 +77,7 @@ class TestCells:
         run_dir = tmp_path / f"runs/{TASK}/tiny/400/seed_0"
         monkeypatch.setitem(run.KNOWN, "tiny", ("cpo", *TINY, "loss.cost_limit=10"))
         with pytest.raises(ValueError, match=r"other options than .*/seed_0: \['loss'\]"):
-            run.keep(run.Cell(TASK, "tiny", 400, 0), run_dir, tmp_path / "results")
+            run.result(run.Cell(TASK, "tiny", 400, 0), run_dir)
 
 
 def made_up(seed=0, task="SafetyPointGoal1", **more):
@@ -107,12 +106,6 @@ def made_up(seed=0, task="SafetyPointGoal1", **more):
 
 
 class TestTable:
-    def test_interval_is_students(self):
-        """Of Student's own sleep data, first drug; R's t.test gives these bounds."""
-        extra = np.array([0.7, -1.6, -0.2, -1.2, -0.1, 3.4, 3.7, 0.8, 0.0, 2.0])
-        assert table.interval(extra) == pytest.approx((-0.5297804, 2.0297804), abs=1e-6)
-        assert np.isnan(table.interval(extra[:1])).all()
-
     def test_mark_needs_reward_and_cost_at_once(self):
         assert table.time_to(made_up(), 20.0) == (180.0, 30)
         assert table.time_to(made_up(), 26.0) is None

@@ -99,20 +99,6 @@ class TestTables:
             assert len({line.count("|") for line in rows}) <= 1, name
 
 
-class TestStatistics:
-    def test_interval_by_hand(self):
-        # Mean 3, deviation sqrt(2.5), five values; Student's t of four degrees is 2.7764.
-        mean, low, high = write_pages.interval([1, 2, 3, 4, 5])
-        assert mean == 3
-        assert high - mean == pytest.approx(2.7764 * (2.5 / 5) ** 0.5, abs=1e-4)
-        assert mean - low == pytest.approx(high - mean)
-
-    def test_permutation_by_hand(self):
-        # Of six splits of four values, the one seen and its mirror are the furthest apart.
-        assert write_pages.permutation_p([1, 2], [3, 4]) == pytest.approx(2 / 6)
-        assert write_pages.permutation_p([1, 4], [2, 3]) == 1
-
-
 @pytest.mark.parametrize("words", ["not kept", "dearest", "gave these same", "is paid for"])
 def test_prose_is_plain(words):
     for page in [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]:

@@ -1541,6 +1541,7 @@ IMPOSSIBLE = {
     "num_threads": (0, "at least 1"),
     "run_dir": ("", "null or a path"),
     "resume": (1, "one of True, False"),
+    "published": ("nobody", "null"),
     "update": ("newton", "'trust_region', 'lagrangian', 'pid'"),
     "safety_critic.kind": ("deviation", "'gaussian', 'quantiles'"),
     "safety_critic.num_quantiles": (1, "at least 2"),

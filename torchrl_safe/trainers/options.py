@@ -31,6 +31,7 @@ from torch import nn
 from typing_extensions import Self
 
 from torchrl_safe.envs import RANDOMIZATIONS, ROBOTS
+from torchrl_safe.trainers.published import PUBLISHED
 from torchrl_safe.trainers.tasks import NAMES, follows
 
 MOST = 2**31 - 1  # what C's int holds
@@ -482,9 +483,25 @@ class Options(Group):
                     f"{name}={plain} needs none."
                 )
 
+    @classmethod
+    def published_values(cls, name: str | None) -> dict[str, Any]:
+        """The options of :data:`~torchrl_safe.trainers.published.PUBLISHED` of this method.
+
+        Raises:
+            ValueError: if there are none of this name.
+        """
+        known = PUBLISHED.get(cls.method, {})
+        if name is None:
+            return {}
+        if name not in known:
+            names = f" or one of {', '.join(map(repr, known))}" if known else ""
+            raise ValueError(f"published must be null{names} for {cls.method}, got {name!r}.")
+        return {option: value for option, (value, _) in known[name].values.items()}
+
     @model_validator(mode="after")
-    def _follow_task(self) -> Self:
-        """Options that nobody has given are what the task says."""
+    def _follow(self) -> Self:
+        """Options that nobody has given are what was published, or the task says."""
+        published = self.published_values(getattr(self, "published", None))
         env = getattr(self, "env", None)
         if not isinstance(env, Env):
             return self
@@ -498,9 +515,10 @@ class Options(Group):
             )
         if env.name == "robot" and env.robot is None and not said:
             raise ValueError(f"env.robot must be one of {', '.join(map(repr, ROBOTS))}, got null.")
-        for name in said.keys() & dict(flat(self)).keys() - repeated:
+        followed = published | said
+        for name in followed.keys() & dict(flat(self)).keys() - repeated:
             group, _, last = name.partition(".")
-            setattr(getattr(self, group), last, said[name])
+            setattr(getattr(self, group), last, followed[name])
             getattr(self, group).model_fields_set.discard(last)  # nobody has given it
         return self
 
@@ -541,6 +559,12 @@ class Options(Group):
 class MethodOptions(Options):
     """What the options of all methods have."""
 
+    published: str | None = option(
+        None,
+        "settings that the method was published with, for all options that are not given",
+        allowed="null or one of the names in published.py that the method has",
+        fixed=True,
+    )
     env: Env = Field(default_factory=Env)
     collector: Collector = Field(default_factory=Collector)
     policy: Policy = Field(default_factory=Policy)

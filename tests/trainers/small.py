@@ -29,6 +29,7 @@ OF_METHOD = {
     "wcsac": GRADIENT,
     "sac_lagrangian": GRADIENT,
     "sac_pid": GRADIENT,
+    "td3_lagrangian": GRADIENT,
     "trc": SURROGATE,
     "cpo": SURROGATE,
     "ppo_lagrangian": SURROGATE,

@@ -38,6 +38,7 @@ CASES = {
     "wcsac": ("wcsac", GRADIENT, {"update/loss_cost_std", "update/multiplier"}),
     "sac_lagrangian": ("sac_lagrangian", GRADIENT, {"update/loss_actor", "update/multiplier"}),
     "sac_pid": ("sac_pid", GRADIENT, {"update/loss_actor", "update/multiplier"}),
+    "td3_lagrangian": ("td3_lagrangian", GRADIENT, {"update/loss_actor", "update/multiplier"}),
     "cpo": ("cpo", SURROGATE, {"update/kl", "update/loss_cost_value"}),
     "trc": ("trc", SURROGATE, {"update/kl", "update/loss_cost_variance"}),
     **{

@@ -12,6 +12,7 @@ from torchrl_safe.trainers.ppo_lagrangian import PPOPID, PPOLagrangian
 from torchrl_safe.trainers.safetac import SafeTAC
 from torchrl_safe.trainers.saved_policies import load_policy
 from torchrl_safe.trainers.tac import TAC
+from torchrl_safe.trainers.td3_lagrangian import TD3Lagrangian
 from torchrl_safe.trainers.trainer import ConstrainedTrainer, Trainer
 from torchrl_safe.trainers.trc import CPO, TRC
 from torchrl_safe.trainers.trpo_lagrangian import TRPOPID, TRPOLagrangian
@@ -31,6 +32,7 @@ __all__ = [
     "PPOLagrangian",
     "SACLagrangian",
     "SafeTAC",
+    "TD3Lagrangian",
     "TRPOLagrangian",
     "Trainer",
     "load_policy",

@@ -6,6 +6,7 @@ from torchrl_safe.trainers.offpolicy_trc import OffPolicyTRC
 from torchrl_safe.trainers.ppo_lagrangian import PPOPID, PPOLagrangian
 from torchrl_safe.trainers.safetac import SafeTAC
 from torchrl_safe.trainers.tac import TAC
+from torchrl_safe.trainers.td3_lagrangian import TD3Lagrangian
 from torchrl_safe.trainers.trainer import Trainer
 from torchrl_safe.trainers.trc import CPO, TRC
 from torchrl_safe.trainers.trpo_lagrangian import TRPOPID, TRPOLagrangian
@@ -14,7 +15,7 @@ from torchrl_safe.trainers.wcsac import SACPID, WCSAC, SACLagrangian
 METHODS: dict[str, type[Trainer]] = {
     method.Options.method: method
     for method in (
-        *(SafeTAC, TAC, WCSAC, SACLagrangian, SACPID),
+        *(SafeTAC, TAC, WCSAC, SACLagrangian, SACPID, TD3Lagrangian),
         *(TRC, CPO, OffPolicyTRC),
         *(PPOLagrangian, PPOPID, TRPOLagrangian, TRPOPID),
     )

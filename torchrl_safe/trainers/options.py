@@ -193,12 +193,30 @@ class SliceBuffer(ReplayBuffer):
     slice_len: int = option(20, "steps per replayed slice: the reach of Retrace", ge=1)
 
 
-class Policy(Group):
-    """The policy, a mixture of Gaussians."""
+class PolicyNetwork(Group):
+    """The network of a policy."""
 
     num_cells: list[int] = option(
         [128, 128], "hidden layers", allowed="a list of integers of at least 1", fixed=True
     )
+
+    @field_validator("num_cells")
+    @classmethod
+    def _check_widths(cls, value: list[int]) -> list[int]:
+        return check_widths(value)
+
+
+class NoisyPolicy(PolicyNetwork):
+    """The policy, deterministic, with noise to explore."""
+
+    noise: float = option(
+        0.1, "standard deviation of the noise to explore, of half the action's range", gt=0
+    )
+
+
+class Policy(PolicyNetwork):
+    """The policy, a mixture of Gaussians."""
+
     num_components: int = option(1, "Gaussians in the mixture, K", ge=1, fixed=True)
     relaxation: Literal["gumbel_softmax", "straight_through", "implicit"] = option(
         "implicit", "the policy gradient through K"
@@ -207,11 +225,6 @@ class Policy(Group):
     log_std_bounds: list[float] = option(
         [-4.0, 2.0], "before tanh", allowed="two finite numbers, the smaller one first"
     )
-
-    @field_validator("num_cells")
-    @classmethod
-    def _check_widths(cls, value: list[int]) -> list[int]:
-        return check_widths(value)
 
     @field_validator("log_std_bounds")
     @classmethod
@@ -537,6 +550,7 @@ class Options(Group):
             *((("env.num_envs", "collector.num_workers"),) if workers else ()),
             ("optim.critic_frames", "replay_buffer.slice_len"),
             ("replay_buffer.batch_size", "replay_buffer.slice_len"),
+            ("optim.num_updates", "optim.policy_delay"),
         ):
             if {name, divisor} <= values.keys() and values[name] % values[divisor]:
                 raise ValueError(

@@ -269,6 +269,34 @@ PUBLISHED: dict[str, dict[str, Published]] = {
             f"{WCSAC_DIFFERS} Its damping (damp_s) is none of these options.",
         ),
     },
+    "td3_lagrangian": {
+        "omnisafe": Published(
+            f"{OMNISAFE}/off-policy/TD3Lag.yaml, its defaults",
+            {
+                "env.num_envs": (1, "vector_env_nums"),
+                "env.episode_length": (1000, "the environment's"),
+                "collector.frames_per_batch": (2000, "steps_per_epoch, once per multiplier's step"),
+                "collector.init_frames": (25_000, "start_learning_steps"),
+                **_widths([256, 256], "hidden_sizes"),
+                "policy.noise": (0.1, "exploration_noise"),
+                "replay_buffer.size": (1_000_000, "size"),
+                "loss.gamma": (0.99, "gamma"),
+                "loss.anneal_frames": (0, "the limit does not move"),
+                "optim.num_updates": (2000, "update_iters / update_cycle: a step per frame"),
+                "optim.minibatch_size": (256, "batch_size"),
+                "optim.lr": (3e-4, "actor lr, critic lr"),
+                "optim.tau": (0.005, "polyak"),
+                "optim.policy_delay": (2, "policy_delay"),
+                "optim.target_noise": (0.2, "policy_noise"),
+                "optim.noise_clip": (0.5, "policy_noise_clip"),
+                "lagrangian.init": (0.001, "lagrangian_multiplier_init"),
+                "lagrangian.lr": (1e-5, "lambda_lr"),
+            },
+            "There the multiplier rests for 100 epochs (warmup_epochs), costs are standardised, "
+            "and gradient steps spread over an epoch. Point and Car have rates of their own, of "
+            "which the policy's (5e-6) is not the critics' (1e-3).",
+        ),
+    },
     "sac_lagrangian": {
         "ray2019": Published(
             "Ray et al. 2019: github.com/openai/safety-starter-agents, safe_rl/sac/sac.py",

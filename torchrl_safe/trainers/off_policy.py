@@ -65,7 +65,7 @@ class SoftUpdates(Group):
     tau: float = option(0.02, "of the target networks, per gradient step", gt=0, le=1)
 
 
-class PricedTrainer(ConstrainedTrainer):
+class PricedActorCritic(ConstrainedTrainer):
     """Critics of actions, target networks, and a policy that follows the Lagrangian.
 
     Each gradient step is one of all networks, on replayed transitions.

@@ -12,7 +12,7 @@ from torch import Tensor
 from torchrl.envs import EnvBase
 from torchrl.objectives import TD3Loss
 
-from torchrl_safe.trainers.off_policy import PricedTrainer, SoftUpdates
+from torchrl_safe.trainers.off_policy import PricedActorCritic, SoftUpdates
 from torchrl_safe.trainers.options import (
     ConstrainedLoss,
     Lagrangian,
@@ -54,7 +54,7 @@ class TD3LagrangianOptions(MethodOptions):
     lagrangian: Lagrangian = Field(default_factory=Lagrangian)
 
 
-class TD3Lagrangian(PricedTrainer):
+class TD3Lagrangian(PricedActorCritic):
     """TD3 with a multiplier on each cost: a deterministic policy, twin critics, delayed steps.
 
     The critics of costs are SAC-Lagrangian's, of the policy as it acts, with its noise.

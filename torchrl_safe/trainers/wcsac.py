@@ -13,7 +13,7 @@ from torchrl.envs import EnvBase
 from torchrl_safe import TsallisLoss
 from torchrl_safe.objectives.functional import q_logarithm
 from torchrl_safe.trainers.off_policy import (
-    PricedTrainer,
+    PricedActorCritic,
     SoftUpdates,
     critic_losses,
     make_reward_loss,
@@ -53,7 +53,7 @@ class WCSACOptions(SoftOptions):
     lagrangian: Lagrangian = Field(default_factory=Lagrangian)
 
 
-class WCSAC(PricedTrainer):
+class WCSAC(PricedActorCritic):
     """Worst-case soft actor-critic: SAC with a multiplier on the CVaR of each cost.
 
     Examples:

@@ -36,6 +36,11 @@ OF_METHOD = {
     "ppo_pid": SURROGATE,
     "trpo_lagrangian": SURROGATE,
     "trpo_pid": SURROGATE,
+    **{
+        f"{base}_{how}": SURROGATE
+        for base in ("ppo", "trpo")
+        for how in ("saute", "early_terminated")
+    },
     "offpolicy_trc": [*SURROGATE, *REPLAY],
 }
 

@@ -45,6 +45,11 @@ CASES = {
         name: (name, SURROGATE, {"update/kl", "update/loss_value", "update/multiplier"})
         for name in ("ppo_lagrangian", "ppo_pid", "trpo_lagrangian", "trpo_pid")
     },
+    **{
+        f"{base}_{how}": (f"{base}_{how}", SURROGATE, {"update/kl", "update/overdrawn"})
+        for base in ("ppo", "trpo")
+        for how in ("saute", "early_terminated")
+    },
     "offpolicy_trc": ("offpolicy_trc", [*SURROGATE, *REPLAY], {"update/kl", "update/loss_value"}),
     "safetac_lagrangian": (
         "safetac",

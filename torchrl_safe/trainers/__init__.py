@@ -6,6 +6,12 @@ from torchrl_safe._extras import need
 
 need("training", "train", "hydra", "imageio", "matplotlib", "pydantic", "tqdm")
 
+from torchrl_safe.trainers.budgets import (
+    PPOEarlyTerminated,
+    PPOSaute,
+    TRPOEarlyTerminated,
+    TRPOSaute,
+)
 from torchrl_safe.trainers.methods import METHODS
 from torchrl_safe.trainers.offpolicy_trc import OffPolicyTRC
 from torchrl_safe.trainers.ppo_lagrangian import PPOPID, PPOLagrangian
@@ -29,11 +35,15 @@ __all__ = [
     "WCSAC",
     "ConstrainedTrainer",
     "OffPolicyTRC",
+    "PPOEarlyTerminated",
     "PPOLagrangian",
+    "PPOSaute",
     "SACLagrangian",
     "SafeTAC",
     "TD3Lagrangian",
+    "TRPOEarlyTerminated",
     "TRPOLagrangian",
+    "TRPOSaute",
     "Trainer",
     "load_policy",
 ]

@@ -2,6 +2,12 @@
 
 from __future__ import annotations
 
+from torchrl_safe.trainers.budgets import (
+    PPOEarlyTerminated,
+    PPOSaute,
+    TRPOEarlyTerminated,
+    TRPOSaute,
+)
 from torchrl_safe.trainers.offpolicy_trc import OffPolicyTRC
 from torchrl_safe.trainers.ppo_lagrangian import PPOPID, PPOLagrangian
 from torchrl_safe.trainers.safetac import SafeTAC
@@ -18,5 +24,6 @@ METHODS: dict[str, type[Trainer]] = {
         *(SafeTAC, TAC, WCSAC, SACLagrangian, SACPID, TD3Lagrangian),
         *(TRC, CPO, OffPolicyTRC),
         *(PPOLagrangian, PPOPID, TRPOLagrangian, TRPOPID),
+        *(PPOSaute, TRPOSaute, PPOEarlyTerminated, TRPOEarlyTerminated),
     )
 }

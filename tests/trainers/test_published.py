@@ -38,7 +38,7 @@ class TestEvery:
         learning = {
             row
             for row, _ in flat(METHODS[method].Options())
-            if row.startswith(("loss.", "optim.", "lagrangian.", "pid.", "critic."))
+            if row.startswith(("loss.", "optim.", "lagrangian.", "pid.", "critic.", "budget."))
         }
         # Of a mixture's one component nothing is relaxed; the others are of machines and failures.
         left = {"loss.initial_cost_limit", "optim.max_skipped", "optim.cuda_graphs"}

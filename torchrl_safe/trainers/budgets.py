@@ -71,7 +71,7 @@ class ClippedBudgetLoss(BudgetLoss):
 class Budget(Group):
     """The budget of an episode."""
 
-    gamma: float = option(
+    budget_gamma: float = option(
         1.0, "discount of the cost in it; what is left is divided by this at each step", gt=0, le=1
     )
 
@@ -92,8 +92,8 @@ class Budget(Group):
             training (bool): whether it is to train in.
             **options: of :class:`~torchrl_safe.envs.SafetyBudget`.
         """
-        budget = rate * sum(self.gamma**step for step in range(steps))
-        options["gamma"] = self.gamma
+        budget = rate * sum(self.budget_gamma**step for step in range(steps))
+        options["gamma"] = self.budget_gamma
         return self.enforced(budget, **options) if training else SafetyBudget(budget, **options)
 
 
@@ -101,7 +101,7 @@ class SauteBudget(Budget):
     """The budget of an episode."""
 
     unsafe_reward: float = option(
-        -1.0, "of a step in training with the budget overdrawn, in place of its reward"
+        -1.0, "of a step in training with the budget overdrawn, in place of its reward", le=0
     )
 
     def enforced(self, budget: float, **options: Any) -> SafetyBudget:
@@ -113,7 +113,7 @@ class TerminationBudget(Budget):
     """The budget of an episode."""
 
     termination_reward: float = option(
-        0.0, "of the step in training that overdraws the budget and ends the episode"
+        0.0, "of the step in training that overdraws the budget and ends the episode", le=0
     )
 
     def enforced(self, budget: float, **options: Any) -> SafetyBudget:

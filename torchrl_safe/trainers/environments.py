@@ -95,7 +95,8 @@ def _budgeted(env: EnvBase, options: MethodOptions, training: bool, how: dict[st
     rate = per_episode(loss.cost_limit, loss.limit_unit, loss.cost_gamma, whole) / whole
     steps = how.get("episode_length", options.env.episode_length if training else whole)
     seen = ["observation"] if "observation" in env.full_observation_spec.keys() else []
-    return TransformedEnv(env, budget.transform(rate, steps, training=training, in_keys=seen))
+    transform = budget.transform(rate, steps, training=training, in_keys=seen)
+    return TransformedEnv(env, transform, auto_unwrap=True)
 
 
 def _make_env(

@@ -39,8 +39,11 @@ def _episodes(frames: int, name: str) -> Values:
         "env.num_envs": (frames // 1000, f"{name} / max_ep_len"),
         "env.episode_length": (1000, "max_ep_len"),
         "collector.frames_per_batch": (frames, name),
-        "loss.anneal_frames": (0, "the limit does not move"),
     }
+
+
+# No source moves its limit.
+STILL: Values = {"loss.anneal_frames": (0, "the limit does not move")}
 
 
 STARTER_AGENTS = (
@@ -50,6 +53,7 @@ STARTER_AGENTS = (
 )
 RAY: Values = {
     **_episodes(30_000, "steps_per_epoch"),
+    **STILL,
     **_widths([256, 256], "hidden_sizes"),
     "policy.num_components": (1, "mlp_actor_critic"),
     "loss.gamma": (0.99, "gamma"),
@@ -111,16 +115,26 @@ OMNISAFE_TRUST_REGION: Values = {
     "optim.max_backtracks": (14, "total_steps of it, the first candidate included"),
 }
 OMNISAFE_MULTIPLIER: Values = {
+    **STILL,
     "lagrangian.init": (0.001, "lagrangian_multiplier_init"),
     "lagrangian.lr": (0.035, "lambda_lr"),
 }
 # There the error is the cost of an episode of 1,000 steps: ten times the discounted sum of gamma
 # 0.99, which it is here.
 OMNISAFE_PID: Values = {
+    **STILL,
     "lagrangian.init": (0.001, "lagrangian_multiplier_init"),
     "pid.kp": (1.0, "pid_kp 0.1, of an episode's cost"),
     "pid.ki": (0.1, "pid_ki 0.01, likewise"),
     "pid.kd": (0.1, "pid_kd 0.01, likewise"),
+}
+OMNISAFE_SAUTE: Values = {
+    "budget.budget_gamma": (0.9999, "saute_gamma"),
+    "budget.unsafe_reward": (-0.2, "unsafe_reward"),
+}
+OMNISAFE_TERMINATED: Values = {
+    "budget.budget_gamma": (1.0, "the plain sum"),
+    "budget.termination_reward": (0.0, "EarlyTerminatedAdapter.step"),
 }
 OMNISAFE_DIFFERS = (
     "There the deviation of actions does not depend on the state, networks have tanh units, "
@@ -130,6 +144,8 @@ OMNISAFE_DIFFERS = (
 OMNISAFE_PID_DIFFERS = (
     f"{OMNISAFE_DIFFERS} The controller's error is smoothed, its derivative over ten batches."
 )
+OMNISAFE_SAUTE_DIFFERS = f"{OMNISAFE_DIFFERS} A budget that is just spent counts as overdrawn."
+OMNISAFE_TERMINATED_DIFFERS = f"{OMNISAFE_DIFFERS} What is left of the budget is not observed."
 
 WCSAC_SETTINGS: Values = {
     "env.num_envs": (1, "one environment per process"),
@@ -142,7 +158,7 @@ WCSAC_SETTINGS: Values = {
     "loss.gamma": (0.99, "gamma"),
     "loss.entropic_index": (1.0, "Shannon entropy"),
     "loss.alpha": (0.69, "softplus of soft_alpha = 0"),
-    "loss.anneal_frames": (0, "the limit does not move"),
+    **STILL,
     "optim.num_updates": (100, "update_freq"),
     "optim.minibatch_size": (256, "batch_size"),
     "optim.lr": (1e-3, "lr"),
@@ -159,7 +175,7 @@ KIM_TRUST_REGION: Values = {
     "policy.num_components": (1, "a Gaussian"),
     "loss.gamma": (0.99, "discount_factor"),
     "loss.lmbda": (0.97, "gae_coeff"),
-    "loss.anneal_frames": (0, "the limit does not move"),
+    **STILL,
     "optim.max_kl": (0.001, "max_kl"),
     "optim.damping": (0.01, "damping_coeff"),
     "optim.cg_iters": (10, "num_conjugate"),
@@ -177,7 +193,7 @@ PUBLISHED: dict[str, dict[str, Published]] = {
         ),
         "omnisafe": Published(
             f"{OMNISAFE}/on-policy/CPO.yaml",
-            OMNISAFE_TRUST_REGION | {"optim.recovery_ratio": (1.0, "optim_case 0")},
+            OMNISAFE_TRUST_REGION | STILL | {"optim.recovery_ratio": (1.0, "optim_case 0")},
             OMNISAFE_DIFFERS,
         ),
     },
@@ -262,6 +278,39 @@ PUBLISHED: dict[str, dict[str, Published]] = {
             OMNISAFE_PID_DIFFERS,
         ),
     },
+    "ppo_saute": {
+        "omnisafe": Published(
+            f"{OMNISAFE}/on-policy/PPOSaute.yaml, of Goal and Circle",
+            {
+                **OMNISAFE_PPO,
+                "optim.critic_rounds": (80, "update_iters"),
+                "optim.num_epochs": (80, "update_iters"),
+                **OMNISAFE_SAUTE,
+            },
+            OMNISAFE_SAUTE_DIFFERS,
+        ),
+    },
+    "trpo_saute": {
+        "omnisafe": Published(
+            f"{OMNISAFE}/on-policy/TRPOSaute.yaml, of Goal and Circle",
+            {**OMNISAFE_TRUST_REGION, **OMNISAFE_SAUTE},
+            OMNISAFE_SAUTE_DIFFERS,
+        ),
+    },
+    "ppo_early_terminated": {
+        "omnisafe": Published(
+            f"{OMNISAFE}/on-policy/PPOEarlyTerminated.yaml",
+            {**OMNISAFE_PPO, **OMNISAFE_TERMINATED},
+            OMNISAFE_TERMINATED_DIFFERS,
+        ),
+    },
+    "trpo_early_terminated": {
+        "omnisafe": Published(
+            f"{OMNISAFE}/on-policy/TRPOEarlyTerminated.yaml",
+            {**OMNISAFE_TRUST_REGION, **OMNISAFE_TERMINATED},
+            OMNISAFE_TERMINATED_DIFFERS,
+        ),
+    },
     "wcsac": {
         "yang2021": Published(
             "Yang et al. 2021, WCSAC: github.com/AlgTUDelft/WCSAC, wc_sac/sac/wcsac.py",
@@ -281,7 +330,7 @@ PUBLISHED: dict[str, dict[str, Published]] = {
                 "policy.noise": (0.1, "exploration_noise"),
                 "replay_buffer.size": (1_000_000, "size"),
                 "loss.gamma": (0.99, "gamma"),
-                "loss.anneal_frames": (0, "the limit does not move"),
+                **STILL,
                 "optim.num_updates": (2000, "update_iters / update_cycle: a step per frame"),
                 "optim.minibatch_size": (256, "batch_size"),
                 "optim.lr": (3e-4, "actor lr, critic lr"),

@@ -143,6 +143,13 @@ def test_workers_must_share_the_environments():
     compose(overrides[1])  # nobody asks for them
 
 
+def test_the_policys_turn_comes_in_every_batch():
+    message = r"optim.num_updates must be a multiple of optim.policy_delay=2, got 121"
+    with pytest.raises(ValueError, match=message):
+        compose("optim.num_updates=121", name="td3_lagrangian")
+    compose("optim.num_updates=121", "optim.policy_delay=11", name="td3_lagrangian")
+
+
 class TestLimit:
     @pytest.mark.parametrize(
         ("named", "frames", "limit"),

@@ -47,6 +47,7 @@ from torchrl_safe import (
 )
 from torchrl_safe.modules import (
     DeterministicAction,
+    DeterministicPolicy,
     GMMParamExtractor,
     divergences,
     export_policy,
@@ -811,6 +812,16 @@ bad(
     "(2, 4, 10)",
     "15",
 )
+make_deterministic = partial(DeterministicPolicy, nn.Linear(3, 2), SPEC)
+each("DeterministicPolicy", make_deterministic, "noise", (0.0, -1.0, NAN, INF), "positive finite")
+bad(
+    "DeterministicPolicy: infinite bounds",
+    lambda: DeterministicPolicy(NETWORK, Bounded(-INF, 1.0, (2,))),
+    ValueError,
+    "action_spec",
+    "inf",
+    "finite bounds",
+)
 make_extractor = partial(GMMParamExtractor, num_components=2, action_dim=2)
 each("GMMParamExtractor", make_extractor, "num_components", (0, 2.0), "at least 1")
 each("GMMParamExtractor", make_extractor, "action_dim", (0, 2.0), "at least 1")
@@ -1193,6 +1204,13 @@ bad(
     "SafeRobotEnv",
     "GymWrapper or GymEnv",
 )
+for name in ("SafetyBudget", "Saute", "EarlyTermination"):
+    make = partial(getattr(envs, name), budget=1.0)
+    each(name, make, "budget", (0.0, -1.0, NAN, INF, "much"), "a positive finite number")
+    each(name, make, "gamma", (0.0, 1.1, NAN), "at most 1")
+each("Saute", partial(envs.Saute, 1.0), "unsafe_reward", (NAN, INF), "a finite number")
+make = partial(envs.EarlyTermination, 1.0)
+each("EarlyTermination", make, "termination_reward", (NAN, INF), "a finite number")
 bad(
     "cost_from_info: frame_skip",
     lambda: envs.cost_from_info(GymEnv("torchrl_safe/PointGoal-v0", frame_skip=2)),
@@ -1541,6 +1559,7 @@ IMPOSSIBLE = {
     "num_threads": (0, "at least 1"),
     "run_dir": ("", "null or a path"),
     "resume": (1, "one of True, False"),
+    "published": ("nobody", "null"),
     "update": ("newton", "'trust_region', 'lagrangian', 'pid'"),
     "safety_critic.kind": ("deviation", "'gaussian', 'quantiles'"),
     "safety_critic.num_quantiles": (1, "at least 2"),
@@ -1586,7 +1605,7 @@ IMPOSSIBLE = {
     "loss.cost_gamma": (-0.1, "[0, 1)"),
     "loss.lmbda": (1.1, "[0, 1]"),
     "loss.risk_level": (0.0, "(0, 1]"),
-    "loss.cost_limit": (-1.0, "[0, inf)"),
+    "loss.cost_limit": (-1.0, ", inf)"),
     "loss.limit_unit": ("week", "'discounted', 'step', 'episode'"),
     "loss.initial_cost_limit": (math.inf, "[0, inf)"),
     "loss.anneal_frames": (-1, "at least 0"),
@@ -1597,11 +1616,18 @@ IMPOSSIBLE = {
     "lagrangian.minibatch_size": (0, "at least 1"),
     "lagrangian.init": (0.0, "(0, inf)"),
     "lagrangian.lr": (-0.1, "(0, inf)"),
+    "budget.budget_gamma": (0.0, "(0, 1]"),
+    "budget.unsafe_reward": (0.5, ", 0]"),
+    "budget.termination_reward": (0.5, ", 0]"),
     "pid.kp": (-1.0, "[0, inf)"),
     "pid.ki": (0.0, "(0, inf)"),
     "pid.kd": (-1.0, "[0, inf)"),
     "optim.policy_lr": (0.0, "(0, inf)"),
     "optim.num_epochs": (0, "at least 1"),
+    "optim.policy_delay": (0, "at least 1"),
+    "optim.target_noise": (-0.1, "[0, inf)"),
+    "optim.noise_clip": (-0.1, "[0, inf)"),
+    "policy.noise": (0.0, "(0, inf)"),
     "optim.num_updates": (0, "at least 1"),
     "optim.tau": (1.5, "(0, 1]"),
     "optim.lr": (0.0, "(0, inf)"),

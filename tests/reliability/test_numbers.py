@@ -200,6 +200,8 @@ class TestMethods:
             ("trc", SURROGATE),
             ("ppo_lagrangian", SURROGATE),
             ("trpo_pid", SURROGATE),
+            ("ppo_saute", SURROGATE),
+            ("td3_lagrangian", f"{GRADIENT} optim.policy_delay=3"),
             ("offpolicy_trc", f"{SURROGATE} {REPLAY}"),
             ("safetac", f"{SURROGATE} {REPLAY} update=pid"),
         ],

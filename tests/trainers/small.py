@@ -29,12 +29,18 @@ OF_METHOD = {
     "wcsac": GRADIENT,
     "sac_lagrangian": GRADIENT,
     "sac_pid": GRADIENT,
+    "td3_lagrangian": GRADIENT,
     "trc": SURROGATE,
     "cpo": SURROGATE,
     "ppo_lagrangian": SURROGATE,
     "ppo_pid": SURROGATE,
     "trpo_lagrangian": SURROGATE,
     "trpo_pid": SURROGATE,
+    **{
+        f"{base}_{how}": SURROGATE
+        for base in ("ppo", "trpo")
+        for how in ("saute", "early_terminated")
+    },
     "offpolicy_trc": [*SURROGATE, *REPLAY],
 }
 

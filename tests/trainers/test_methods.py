@@ -38,11 +38,17 @@ CASES = {
     "wcsac": ("wcsac", GRADIENT, {"update/loss_cost_std", "update/multiplier"}),
     "sac_lagrangian": ("sac_lagrangian", GRADIENT, {"update/loss_actor", "update/multiplier"}),
     "sac_pid": ("sac_pid", GRADIENT, {"update/loss_actor", "update/multiplier"}),
+    "td3_lagrangian": ("td3_lagrangian", GRADIENT, {"update/loss_actor", "update/multiplier"}),
     "cpo": ("cpo", SURROGATE, {"update/kl", "update/loss_cost_value"}),
     "trc": ("trc", SURROGATE, {"update/kl", "update/loss_cost_variance"}),
     **{
         name: (name, SURROGATE, {"update/kl", "update/loss_value", "update/multiplier"})
         for name in ("ppo_lagrangian", "ppo_pid", "trpo_lagrangian", "trpo_pid")
+    },
+    **{
+        f"{base}_{how}": (f"{base}_{how}", SURROGATE, {"update/kl", "update/overdrawn"})
+        for base in ("ppo", "trpo")
+        for how in ("saute", "early_terminated")
     },
     "offpolicy_trc": ("offpolicy_trc", [*SURROGATE, *REPLAY], {"update/kl", "update/loss_value"}),
     "safetac_lagrangian": (

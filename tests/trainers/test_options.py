@@ -143,6 +143,13 @@ def test_workers_must_share_the_environments():
     compose(overrides[1])  # nobody asks for them
 
 
+def test_the_policys_turn_comes_in_every_batch():
+    message = r"optim.num_updates must be a multiple of optim.policy_delay=2, got 121"
+    with pytest.raises(ValueError, match=message):
+        compose("optim.num_updates=121", name="td3_lagrangian")
+    compose("optim.num_updates=121", "optim.policy_delay=11", name="td3_lagrangian")
+
+
 class TestLimit:
     @pytest.mark.parametrize(
         ("named", "frames", "limit"),
@@ -335,4 +342,5 @@ def test_page_of_configurations_is_the_declared_one(monkeypatch):
     root = Path(options.__file__).parents[2]
     monkeypatch.syspath_prepend(root / "docs")
     write_options = importlib.import_module("write_options")
-    assert write_options.PAGE.read_text() == write_options.text(), "run docs/write_options.py"
+    for page in write_options.PAGES:
+        assert page.read_text() == write_options.text(page), "run docs/write_options.py"

@@ -14,6 +14,7 @@ from torchrl_safe._deprecation import moved
 from torchrl_safe.envs._moved import keep_old_paths
 from torchrl_safe.envs.adapters import CostToReward, cost_from_info
 from torchrl_safe.envs.bridge import SafetyGymnasiumBridge
+from torchrl_safe.envs.budgets import EarlyTermination, SafetyBudget, Saute
 from torchrl_safe.envs.checks import check_safe_env
 from torchrl_safe.envs.interfaces.registration import register_envs
 from torchrl_safe.envs.randomization import (
@@ -46,6 +47,7 @@ __all__ = [
     "VELOCITY_TASKS",
     "CostFunction",
     "CostToReward",
+    "EarlyTermination",
     "GoalTask",
     "GymRobotEnv",
     "GymRobotVectorEnv",
@@ -61,7 +63,9 @@ __all__ = [
     "SafeGoalEnv",
     "SafeRobotEnv",
     "SafeVelocityEnv",
+    "SafetyBudget",
     "SafetyGymnasiumBridge",
+    "Saute",
     "VelocityTask",
     "check_safe_env",
     "cost_from_info",

@@ -1,6 +1,7 @@
-"""The mixture policy: its distribution, its actor, and distances of policies."""
+"""Policies: the mixture, its distribution and distances; a deterministic one with noise."""
 
 from torchrl_safe.modules.actors import GMMParamExtractor, GMMTanhPolicy
+from torchrl_safe.modules.deterministic import ClippedGaussian, DeterministicPolicy
 from torchrl_safe.modules.distributions import (
     Relaxation,
     TanhGaussianMixture,
@@ -23,7 +24,9 @@ __all__ = [
     "DISTANCES",
     "MATCHED_BOUND",
     "MOMENT_MATCHED",
+    "ClippedGaussian",
     "DeterministicAction",
+    "DeterministicPolicy",
     "Distance",
     "GMMParamExtractor",
     "GMMTanhPolicy",

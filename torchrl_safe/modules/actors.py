@@ -174,7 +174,7 @@ class GMMTanhPolicy(ProbabilisticActor):
         log_std_bounds: tuple[float, float] = (-4.0, 2.0),
         return_log_prob: bool = True,
     ) -> None:
-        spec = _single_action_spec(action_spec)
+        spec = single_action_spec(action_spec)
         extractor = GMMParamExtractor(num_components, spec.shape[-1], log_std_bounds=log_std_bounds)
         parameters = ["logits", "loc", "scale"]
         distribution_kwargs = {
@@ -246,7 +246,7 @@ class _Headed(nn.Sequential):
         return head(features)
 
 
-def _single_action_spec(spec: TensorSpec) -> Bounded:
+def single_action_spec(spec: TensorSpec) -> Bounded:
     """The spec of one action out of that of a batch of them."""
     if not isinstance(spec, Bounded) or not spec.dtype.is_floating_point or spec.ndim < 1:
         raise TypeError(

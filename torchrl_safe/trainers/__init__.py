@@ -6,12 +6,19 @@ from torchrl_safe._extras import need
 
 need("training", "train", "hydra", "imageio", "matplotlib", "pydantic", "tqdm")
 
+from torchrl_safe.trainers.budgets import (
+    PPOEarlyTerminated,
+    PPOSaute,
+    TRPOEarlyTerminated,
+    TRPOSaute,
+)
 from torchrl_safe.trainers.methods import METHODS
 from torchrl_safe.trainers.offpolicy_trc import OffPolicyTRC
 from torchrl_safe.trainers.ppo_lagrangian import PPOPID, PPOLagrangian
 from torchrl_safe.trainers.safetac import SafeTAC
 from torchrl_safe.trainers.saved_policies import load_policy
 from torchrl_safe.trainers.tac import TAC
+from torchrl_safe.trainers.td3_lagrangian import TD3Lagrangian
 from torchrl_safe.trainers.trainer import ConstrainedTrainer, Trainer
 from torchrl_safe.trainers.trc import CPO, TRC
 from torchrl_safe.trainers.trpo_lagrangian import TRPOPID, TRPOLagrangian
@@ -28,10 +35,15 @@ __all__ = [
     "WCSAC",
     "ConstrainedTrainer",
     "OffPolicyTRC",
+    "PPOEarlyTerminated",
     "PPOLagrangian",
+    "PPOSaute",
     "SACLagrangian",
     "SafeTAC",
+    "TD3Lagrangian",
+    "TRPOEarlyTerminated",
     "TRPOLagrangian",
+    "TRPOSaute",
     "Trainer",
     "load_policy",
 ]

@@ -3,7 +3,7 @@
     torchrl-safe train safetac env.robot=point
     torchrl-safe train safetac env.task=SafetyPointGoal1
     torchrl-safe train cpo env=gym env.id=Pendulum-v1 env.cost=my_costs:speed
-    torchrl-safe train trc --multirun seed=0,1,2
+    torchrl-safe train trc published=kim2022 --multirun seed=0,1,2
     torchrl-safe evaluate runs/safetac/point/seed_0
     torchrl-safe report runs/safetac/point/seed_0
     torchrl-safe play safetac-point
@@ -32,6 +32,7 @@ from torchrl.checkpoint import CheckpointError
 from torchrl_safe.trainers.commands import evaluate, export, play, report, watch
 from torchrl_safe.trainers.methods import METHODS
 from torchrl_safe.trainers.options import Options, flat
+from torchrl_safe.trainers.published import PUBLISHED
 from torchrl_safe.trainers.tasks import follows
 
 CANNOT = (CheckpointError, ModuleNotFoundError, OSError, ValueError)  # with what to do about it
@@ -148,15 +149,19 @@ def compose(method: str, overrides: Sequence[str] = (), **defaults: Any) -> Any:
 
 
 def defaults_for(method: str, arguments: Sequence[str]) -> Any:
-    """The options of a method of which at most the task is given, as hydra's arguments say it.
+    """The options of a method of which at most those are given that others follow from.
 
-    What is printed by ``--cfg job`` is then what follows from the task. A sweep over tasks prints
-    the defaults of none, and every job of it follows its own.
+    What is printed by ``--cfg job`` is then what follows from the task, and what was published. A
+    sweep over them prints the defaults of none, and every job of it follows its own.
     """
     options = Options.known[method]
     words = [word.lstrip("+").partition("=") for word in arguments]
-    tasks = [value for name, _, value in words if name == "env.task"]
-    return options.of(**{"env.task": tasks[-1]}) if tasks and follows(tasks[-1]) else options()
+    values = {name: value for name, _, value in words}
+    known = {
+        "env.task": bool(follows(values.get("env.task"))),
+        "published": values.get("published") in PUBLISHED.get(method, {}),
+    }
+    return options.of(**{name: values[name] for name, is_one in known.items() if is_one})
 
 
 def register(standard: Options, **defaults: Any) -> str:

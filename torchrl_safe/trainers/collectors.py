@@ -17,7 +17,7 @@ from torchrl.collectors import (
     MultiAsyncCollector,
     MultiSyncCollector,
 )
-from torchrl.envs import EnvBase
+from torchrl.envs import EnvBase, TransformedEnv
 from torchrl.envs.utils import ExplorationType
 from torchrl.weight_update import SharedMemWeightSyncScheme
 
@@ -102,17 +102,22 @@ class ResumableCollector(Collector):
         """The collector's state, the environment's, and what the next action will be drawn for."""
         return {
             "collector": super().state_dict(),
-            "env": self.env.state_dict(),
+            "env": self._stateful_env.state_dict(),
             "carrier": self._carrier.to_dict(),
         }
 
     def load_state_dict(self, state_dict: Mapping[str, Any], **kwargs: Any) -> None:
         """Put everything back."""
         super().load_state_dict(state_dict["collector"], **kwargs)
-        self.env.load_state_dict(state_dict["env"])
+        self._stateful_env.load_state_dict(state_dict["env"])
         carrier = TensorDict(state_dict["carrier"], self._carrier.batch_size)
         self._carrier.update(carrier.clone(), inplace=False)
         self._traj_pool.load_state_dict(state_dict["collector"]["traj_pool"])
+
+    @property
+    def _stateful_env(self) -> EnvBase:
+        """What is below transforms, whose own state is the carrier's."""
+        return self.env.base_env if isinstance(self.env, TransformedEnv) else self.env
 
 
 _Collector: Any = object  # one of several processes, whose methods these are

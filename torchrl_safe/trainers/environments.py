@@ -25,9 +25,9 @@ from torchrl.envs import (
 from torchrl.envs.batched_envs import BatchedEnvBase
 
 from torchrl_safe._costs import violation_key
-from torchrl_safe.envs import RANDOMIZATIONS
+from torchrl_safe.envs import RANDOMIZATIONS, SafetyBudget
 from torchrl_safe.envs.tasks import SAFETY_TASKS, get_task
-from torchrl_safe.trainers.options import MethodOptions
+from torchrl_safe.trainers.options import MethodOptions, per_episode
 from torchrl_safe.trainers.tasks import RUNNERS
 from torchrl_safe.trainers.threads import most_threads
 
@@ -82,7 +82,21 @@ def make_env(
             f"the environment must have a cost {missing[0]!r} beside the reward in its reward "
             f"spec, which has {rewards}. loss.cost_limit names others: {{name: limit}}."
         )
-    return env
+    return _budgeted(env, options, training, how)
+
+
+def _budgeted(env: EnvBase, options: MethodOptions, training: bool, how: dict[str, Any]) -> EnvBase:
+    """The environment with the budget that a method's options may ask for."""
+    budget: Any = getattr(options, "budget", None)
+    if budget is None:
+        return env
+    loss: Any = options.loss  # type: ignore[attr-defined]
+    whole = options.eval.num_steps
+    rate = per_episode(loss.cost_limit, loss.limit_unit, loss.cost_gamma, whole) / whole
+    steps = how.get("episode_length", options.env.episode_length if training else whole)
+    seen = ["observation"] if "observation" in env.full_observation_spec.keys() else []
+    transform = budget.transform(rate, steps, training=training, in_keys=seen)
+    return TransformedEnv(env, transform, auto_unwrap=True)
 
 
 def _make_env(
@@ -178,9 +192,14 @@ def imported(option: str, name: str) -> Callable[..., Any]:
 
 
 def has_state(env: EnvBase) -> bool:
-    """Whether an environment's ``state_dict`` is all that its future depends on: of ours it is."""
+    """Whether an environment's future depends on its ``state_dict`` alone, and on the last step.
+
+    Of ours it does, also with a budget, which is in the step.
+    """
     from torchrl_safe.envs._batched import BatchedEnv
 
+    if isinstance(env, TransformedEnv) and isinstance(env.transform, SafetyBudget):
+        return has_state(env.base_env)
     return isinstance(env, BatchedEnv)
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 from tensordict.nn import TensorDictModule
-from torch import nn
+from torch import Tensor, nn
 from torchrl.data import Categorical, OneHot, TensorSpec
 from torchrl.envs import EnvBase
 from torchrl.modules import (
@@ -16,7 +16,8 @@ from torchrl.modules import (
 )
 
 from torchrl_safe import GMMTanhPolicy
-from torchrl_safe.trainers.options import MethodOptions
+from torchrl_safe.modules import DeterministicPolicy
+from torchrl_safe.trainers.options import MethodOptions, NoisyPolicy
 
 MakeNetwork = Callable[[list[TensorSpec], int], nn.Module]
 """From the specs of a network's inputs and its number of outputs to the network."""
@@ -33,8 +34,8 @@ def make_policy(
     *,
     in_keys: Sequence[str] = ("observation",),
     network: MakeNetwork | None = None,
-) -> GMMTanhPolicy | ProbabilisticActor:
-    """The mixture policy (11); of discrete actions, a categorical one.
+) -> ProbabilisticActor:
+    """The policy of the options, the mixture (11) in most; of discrete actions, a categorical one.
 
     Args:
         options (MethodOptions): ``policy``.
@@ -57,6 +58,9 @@ def make_policy(
             return_log_prob=True,
             log_prob_key="action_log_prob",
         )
+    if isinstance(options.policy, NoisyPolicy):
+        module = _make(inputs, spec.shape[-1], options.policy.num_cells, options.device, network)
+        return DeterministicPolicy(module, spec, noise=options.policy.noise, in_keys=list(in_keys))
     num_outputs = options.policy.num_components * (1 + 2 * spec.shape[-1])
     module = _make(inputs, num_outputs, options.policy.num_cells, options.device, network)
     low, high = options.policy.log_std_bounds
@@ -88,8 +92,16 @@ def make_critic(
         inputs, num_outputs, options.critic.num_cells, options.device, network, inplace=True
     )
     if last:
-        module = module.extend(last) if isinstance(module, MLP) else nn.Sequential(module, *last)
+        module = module.extend(last) if isinstance(module, MLP) else _Chain(module, *last)
     return ValueOperator(module, in_keys=keys, out_keys=[out_key])
+
+
+class _Chain(nn.Sequential):
+    """A network of one or more inputs, then layers."""
+
+    def forward(self, *inputs: Tensor) -> Tensor:
+        network, *layers = self
+        return nn.Sequential(*layers)(network(*inputs))
 
 
 def _make(

@@ -20,13 +20,15 @@ from torchrl.data import (
     TensorDictReplayBuffer,
 )
 from torchrl.envs import EnvBase
-from torchrl.objectives import LossModule
+from torchrl.objectives import LossModule, SoftUpdate, ValueEstimators
 
 from torchrl_safe import CVaRCostLoss, TsallisLoss
 from torchrl_safe.envs import Reflection
+from torchrl_safe.objectives import lagrangian
 from torchrl_safe.objectives.value import PolicyEvaluation, evaluate_policy
 from torchrl_safe.optim import FiniteSteps
 from torchrl_safe.trainers.options import Group, option
+from torchrl_safe.trainers.policy_steps import make_multiplier
 from torchrl_safe.trainers.trainer import ConstrainedTrainer, Trainer
 
 
@@ -61,6 +63,100 @@ class SoftUpdates(Group):
         100, "gradient steps per update skipped as not finite, before the run stops", ge=0
     )
     tau: float = option(0.02, "of the target networks, per gradient step", gt=0, le=1)
+
+
+class PricedActorCritic(ConstrainedTrainer):
+    """Critics of actions, target networks, and a policy that follows the Lagrangian.
+
+    Each gradient step is one of all networks, on replayed transitions.
+    """
+
+    policy_delay: int = 1
+
+    def build(self, env: EnvBase) -> dict[str, Any]:
+        """A policy, losses of reward and costs with target networks, and a multiplier."""
+        options = self.options
+        self.policy = self.make_policy(env)
+        self.reward_loss = self.make_reward_loss(env)
+        self.cost_losses = make_cost_losses(self, env, delay_cost=True)
+        self.reward_loss.make_value_estimator(ValueEstimators.TD0, gamma=options.loss.gamma)
+        for loss in self.cost_losses.values():
+            loss.make_value_estimator(ValueEstimators.TD0, gamma=options.loss.cost_gamma)
+        losses = [self.reward_loss, *self.cost_losses.values()]
+        self.targets = [SoftUpdate(loss, tau=options.optim.tau) for loss in losses]
+        optim = joint_optim(losses, options.optim.lr)
+        self.steps = FiniteSteps(optim, max_skipped=options.optim.max_skipped)
+        self.multiplier = make_multiplier(self)
+        self.buffer = make_buffer(self)
+        return {
+            "reward_loss": self.reward_loss,
+            **as_components(self, "cost_loss", self.cost_losses),
+            "optim": optim,
+            "multiplier": self.multiplier,
+            "buffer": self.buffer,
+        }
+
+    def make_reward_loss(self, env: EnvBase) -> Any:
+        """The loss of the reward, with critics of its own."""
+        raise NotImplementedError
+
+    def critic_losses(self, minibatch: TensorDictBase) -> TensorDictBase:
+        """Losses of all critics."""
+        raise NotImplementedError
+
+    def policy_losses(
+        self, minibatch: TensorDictBase, limits: Mapping[str, float]
+    ) -> dict[str, Tensor]:
+        """Losses of the policy, and of what is learned with it."""
+        raise NotImplementedError
+
+    def update(self, batch: TensorDictBase) -> dict[str, float]:
+        """The multiplier on the new batch's cost, then gradient steps on replayed transitions.
+
+        Of every ``policy_delay`` steps, the last moves policy and target networks.
+        """
+        self.buffer.extend(batch.select(*replayed(self)).flatten())
+        if self.frames < self.options.collector.init_frames:
+            return {}
+        limits = self.limits()
+        levels = {cost: loss.on_policy_cvar(batch) for cost, loss in self.cost_losses.items()}
+        priced = self.multiplier.react(self, levels)
+        with timeit("time/update"):
+            for step in range(1, self.options.optim.num_updates + 1):
+                minibatch = self.buffer.sample()
+                losses = self.critic_losses(minibatch)
+                moves = step % self.policy_delay == 0
+                if moves:
+                    losses.update(self.policy_losses(minibatch, limits))
+                self.steps.step(losses)
+                for target in self.targets if moves else ():
+                    target.step()
+        return {
+            **{f"update/{name}": value.item() for name, value in losses.items()},
+            **priced,
+            "update/skipped_steps": float(self.steps.count()),
+        }
+
+    def priced(
+        self,
+        objective: Tensor,
+        minibatch: TensorDictBase,
+        action: Tensor,
+        limits: Mapping[str, float],
+    ) -> Tensor:
+        """The Lagrangian of an objective and of the costs of one action, as the objective is.
+
+        Args:
+            objective (Tensor): a scalar.
+            minibatch (TensorDictBase): states, ``[B]``.
+            action (Tensor): the policy's in them, ``[B, D]``.
+            limits (mapping): on discounted sums, by cost.
+        """
+        constraints = [
+            self.cost_losses[cost].cvar(minibatch, action).mean() - limit
+            for cost, limit in limits.items()
+        ]
+        return lagrangian(objective, torch.stack(constraints), self.multiplier())
 
 
 def replayed(trainer: Trainer) -> list[Any]:

@@ -31,6 +31,7 @@ from torch import nn
 from typing_extensions import Self
 
 from torchrl_safe.envs import RANDOMIZATIONS, ROBOTS
+from torchrl_safe.trainers.published import PUBLISHED
 from torchrl_safe.trainers.tasks import NAMES, follows
 
 MOST = 2**31 - 1  # what C's int holds
@@ -192,12 +193,30 @@ class SliceBuffer(ReplayBuffer):
     slice_len: int = option(20, "steps per replayed slice: the reach of Retrace", ge=1)
 
 
-class Policy(Group):
-    """The policy, a mixture of Gaussians."""
+class PolicyNetwork(Group):
+    """The network of a policy."""
 
     num_cells: list[int] = option(
         [128, 128], "hidden layers", allowed="a list of integers of at least 1", fixed=True
     )
+
+    @field_validator("num_cells")
+    @classmethod
+    def _check_widths(cls, value: list[int]) -> list[int]:
+        return check_widths(value)
+
+
+class NoisyPolicy(PolicyNetwork):
+    """The policy, deterministic, with noise to explore."""
+
+    noise: float = option(
+        0.1, "standard deviation of the noise to explore, of half the action's range", gt=0
+    )
+
+
+class Policy(PolicyNetwork):
+    """The policy, a mixture of Gaussians."""
+
     num_components: int = option(1, "Gaussians in the mixture, K", ge=1, fixed=True)
     relaxation: Literal["gumbel_softmax", "straight_through", "implicit"] = option(
         "implicit", "the policy gradient through K"
@@ -206,11 +225,6 @@ class Policy(Group):
     log_std_bounds: list[float] = option(
         [-4.0, 2.0], "before tanh", allowed="two finite numbers, the smaller one first"
     )
-
-    @field_validator("num_cells")
-    @classmethod
-    def _check_widths(cls, value: list[int]) -> list[int]:
-        return check_widths(value)
 
     @field_validator("log_std_bounds")
     @classmethod
@@ -482,9 +496,25 @@ class Options(Group):
                     f"{name}={plain} needs none."
                 )
 
+    @classmethod
+    def published_values(cls, name: str | None) -> dict[str, Any]:
+        """The options of :data:`~torchrl_safe.trainers.published.PUBLISHED` of this method.
+
+        Raises:
+            ValueError: if there are none of this name.
+        """
+        known = PUBLISHED.get(cls.method, {})
+        if name is None:
+            return {}
+        if name not in known:
+            names = f" or one of {', '.join(map(repr, known))}" if known else ""
+            raise ValueError(f"published must be null{names} for {cls.method}, got {name!r}.")
+        return {option: value for option, (value, _) in known[name].values.items()}
+
     @model_validator(mode="after")
-    def _follow_task(self) -> Self:
-        """Options that nobody has given are what the task says."""
+    def _follow(self) -> Self:
+        """Options that nobody has given are what was published, or the task says."""
+        published = self.published_values(getattr(self, "published", None))
         env = getattr(self, "env", None)
         if not isinstance(env, Env):
             return self
@@ -498,9 +528,10 @@ class Options(Group):
             )
         if env.name == "robot" and env.robot is None and not said:
             raise ValueError(f"env.robot must be one of {', '.join(map(repr, ROBOTS))}, got null.")
-        for name in said.keys() & dict(flat(self)).keys() - repeated:
+        followed = published | said
+        for name in followed.keys() & dict(flat(self)).keys() - repeated:
             group, _, last = name.partition(".")
-            setattr(getattr(self, group), last, said[name])
+            setattr(getattr(self, group), last, followed[name])
             getattr(self, group).model_fields_set.discard(last)  # nobody has given it
         return self
 
@@ -519,6 +550,7 @@ class Options(Group):
             *((("env.num_envs", "collector.num_workers"),) if workers else ()),
             ("optim.critic_frames", "replay_buffer.slice_len"),
             ("replay_buffer.batch_size", "replay_buffer.slice_len"),
+            ("optim.num_updates", "optim.policy_delay"),
         ):
             if {name, divisor} <= values.keys() and values[name] % values[divisor]:
                 raise ValueError(
@@ -541,6 +573,12 @@ class Options(Group):
 class MethodOptions(Options):
     """What the options of all methods have."""
 
+    published: str | None = option(
+        None,
+        "settings that the method was published with, for all options that are not given",
+        allowed="null or one of the names in published.py that the method has",
+        fixed=True,
+    )
     env: Env = Field(default_factory=Env)
     collector: Collector = Field(default_factory=Collector)
     policy: Policy = Field(default_factory=Policy)

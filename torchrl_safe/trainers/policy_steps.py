@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 import torch
+from pydantic import Field
 from tensordict import TensorDict
 from torch import Tensor, nn
 
@@ -38,6 +39,19 @@ class PID(Group):
     kp: float = option(0.05, "proportional gain, per unit of discounted cost", ge=0)
     ki: float = option(0.01, "integral gain", gt=0)
     kd: float = option(0.05, "derivative gain", ge=0)
+
+
+class Priced(Group):
+    """What the options of methods have whose multiplier learns from every batch."""
+
+    lagrangian: QuickLagrangian = Field(default_factory=QuickLagrangian)
+
+
+class Controlled(Group):
+    """What the options of methods have whose multiplier a controller sets."""
+
+    lagrangian: InitialPrice = Field(default_factory=InitialPrice)
+    pid: PID = Field(default_factory=PID)
 
 
 def make_trust_region(

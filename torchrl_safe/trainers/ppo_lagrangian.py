@@ -11,8 +11,8 @@ from torchrl.objectives import ClipPPOLoss
 
 from torchrl_safe.objectives import lagrangian
 from torchrl_safe.trainers.on_policy import GradientOptions, GradientTrainer, MeanSurrogateLoss
-from torchrl_safe.trainers.options import InitialPrice, MethodOptions, option
-from torchrl_safe.trainers.policy_steps import PID, QuickLagrangian, make_multiplier
+from torchrl_safe.trainers.options import MethodOptions, option
+from torchrl_safe.trainers.policy_steps import Controlled, Priced, make_multiplier
 
 
 class ClippedLoss(MeanSurrogateLoss):
@@ -27,12 +27,10 @@ class ClippedOptions(GradientOptions):
     loss: ClippedLoss = Field(default_factory=ClippedLoss)
 
 
-class PPOLagrangianOptions(ClippedOptions):
+class PPOLagrangianOptions(Priced, ClippedOptions):
     """The options of PPO-Lagrangian."""
 
     method: ClassVar[str] = "ppo_lagrangian"
-
-    lagrangian: QuickLagrangian = Field(default_factory=QuickLagrangian)
 
 
 class PPOLagrangian(GradientTrainer):
@@ -67,13 +65,10 @@ class PPOLagrangian(GradientTrainer):
         return {**self.descend(data, self.policy_loss), **priced, **self.deviations(measured)}
 
 
-class PPOPIDOptions(ClippedOptions):
+class PPOPIDOptions(Controlled, ClippedOptions):
     """The options of PPO-PID."""
 
     method: ClassVar[str] = "ppo_pid"
-
-    lagrangian: InitialPrice = Field(default_factory=InitialPrice)
-    pid: PID = Field(default_factory=PID)
 
 
 class PPOPID(PPOLagrangian):

@@ -10,8 +10,8 @@ from torchrl.envs import EnvBase
 
 from torchrl_safe.objectives import lagrangian
 from torchrl_safe.trainers.on_policy import KLOptim, OnPolicyOptions, TrustRegionTrainer
-from torchrl_safe.trainers.options import InitialPrice, MethodOptions
-from torchrl_safe.trainers.policy_steps import PID, QuickLagrangian, make_multiplier
+from torchrl_safe.trainers.options import MethodOptions
+from torchrl_safe.trainers.policy_steps import Controlled, Priced, make_multiplier
 
 
 class KLOptions(OnPolicyOptions):
@@ -20,12 +20,10 @@ class KLOptions(OnPolicyOptions):
     optim: KLOptim = Field(default_factory=KLOptim)
 
 
-class TRPOLagrangianOptions(KLOptions):
+class TRPOLagrangianOptions(Priced, KLOptions):
     """The options of TRPO-Lagrangian."""
 
     method: ClassVar[str] = "trpo_lagrangian"
-
-    lagrangian: QuickLagrangian = Field(default_factory=QuickLagrangian)
 
 
 class TRPOLagrangian(TrustRegionTrainer):
@@ -59,13 +57,10 @@ class TRPOLagrangian(TrustRegionTrainer):
         return {**report.to_dict(), **priced, **self.deviations(measured)}
 
 
-class TRPOPIDOptions(KLOptions):
+class TRPOPIDOptions(Controlled, KLOptions):
     """The options of TRPO-PID."""
 
     method: ClassVar[str] = "trpo_pid"
-
-    lagrangian: InitialPrice = Field(default_factory=InitialPrice)
-    pid: PID = Field(default_factory=PID)
 
 
 class TRPOPID(TRPOLagrangian):

@@ -37,6 +37,7 @@ CASES = {
     "ppo_pid": (GRADIENT | PID, 100),
     "trpo_lagrangian": (REGION | MULTIPLIER, 100),
     "trpo_pid": (REGION | PID, 100),
+    "focops": (GRADIENT | MULTIPLIER | {"max_kl": 0.05}, 100),
 }
 
 

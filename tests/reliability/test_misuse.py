@@ -254,6 +254,29 @@ bad(
     "(3, 1)",
     "that of log_prob",
 )
+each(
+    "clipped_surrogate",
+    partial(F.clipped_surrogate, zeros(3), zeros(3), zeros(3)),
+    "clip_epsilon",
+    (0.0, 1.0, NAN),
+    "in (0, 1)",
+)
+for name in ("kl_weight", "max_kl"):
+    each(
+        "focops_loss",
+        partial(F.focops_loss, *[zeros(3)] * 4, kl_weight=1.0, max_kl=0.1),
+        name,
+        (0.0, -1.0, NAN, INF),
+        "positive finite number",
+    )
+for name, call in (
+    ("clipped_surrogate", lambda: F.clipped_surrogate(zeros(3), zeros(3), zeros(3, 1), 0.2)),
+    (
+        "focops_loss",
+        lambda: F.focops_loss(*[zeros(3)] * 3, zeros(3, 1), kl_weight=1.0, max_kl=0.1),
+    ),
+):
+    bad(f"{name}: shapes", call, ValueError, "advantage", "(3, 1)", "that of log_prob")
 EYE = torch.eye(2)
 for name, moments in {
     "old_cov": (zeros(2), torch.eye(3), zeros(2), EYE),
@@ -1592,6 +1615,7 @@ IMPOSSIBLE = {
     "loss.anneal_frames": (-1, "at least 0"),
     "loss.variance_reward": ("none", "'td_error', 'second_moment'"),
     "loss.clip_epsilon": (0.0, "(0, 1)"),
+    "loss.kl_weight": (0.0, "(0, inf)"),
     "loss.entropy_coeff": (-1.0, "[0, inf)"),
     "lagrangian.policy_lr": (0.0, "(0, inf)"),
     "lagrangian.minibatch_size": (0, "at least 1"),

@@ -200,6 +200,7 @@ class TestMethods:
             ("trc", SURROGATE),
             ("ppo_lagrangian", SURROGATE),
             ("trpo_pid", SURROGATE),
+            ("focops", SURROGATE),
             ("offpolicy_trc", f"{SURROGATE} {REPLAY}"),
             ("safetac", f"{SURROGATE} {REPLAY} update=pid"),
         ],

@@ -35,6 +35,7 @@ OF_METHOD = {
     "ppo_pid": SURROGATE,
     "trpo_lagrangian": SURROGATE,
     "trpo_pid": SURROGATE,
+    "focops": SURROGATE,
     "offpolicy_trc": [*SURROGATE, *REPLAY],
 }
 

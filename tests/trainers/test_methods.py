@@ -42,7 +42,7 @@ CASES = {
     "trc": ("trc", SURROGATE, {"update/kl", "update/loss_cost_variance"}),
     **{
         name: (name, SURROGATE, {"update/kl", "update/loss_value", "update/multiplier"})
-        for name in ("ppo_lagrangian", "ppo_pid", "trpo_lagrangian", "trpo_pid")
+        for name in ("ppo_lagrangian", "ppo_pid", "trpo_lagrangian", "trpo_pid", "focops")
     },
     "offpolicy_trc": ("offpolicy_trc", [*SURROGATE, *REPLAY], {"update/kl", "update/loss_value"}),
     "safetac_lagrangian": (

@@ -17,7 +17,12 @@ from torchrl._utils import timeit
 from torchrl.envs import EnvBase
 
 from torchrl_safe.modules import DISTANCES
-from torchrl_safe.objectives import CostMoments, CVaRSurrogateLoss, ReturnSurrogateLoss
+from torchrl_safe.objectives import (
+    CostMoments,
+    CVaRSurrogateLoss,
+    ReturnSurrogateLoss,
+    lagrangian,
+)
 from torchrl_safe.optim import FiniteSteps
 from torchrl_safe.trainers.networks import is_discrete
 from torchrl_safe.trainers.off_policy import as_components, minibatches
@@ -31,7 +36,7 @@ from torchrl_safe.trainers.options import (
     again,
     option,
 )
-from torchrl_safe.trainers.policy_steps import make_trust_region
+from torchrl_safe.trainers.policy_steps import make_multiplier, make_trust_region
 from torchrl_safe.trainers.trainer import ConstrainedTrainer
 
 
@@ -357,3 +362,32 @@ class GradientTrainer(SurrogateTrainer):
             "update/epochs": float(epochs),
             "update/skipped_steps": float(self.policy_steps.count()),
         }
+
+
+class PricedTrainer(GradientTrainer):
+    """Gradient steps on the advantage of the Lagrangian, whose multipliers follow the costs."""
+
+    def build(self, env: EnvBase) -> dict[str, Any]:
+        """A policy, surrogates with critics of states, the policy's optimizer, a multiplier."""
+        self.multiplier = make_multiplier(self)
+        return {**super().build(env), "multiplier": self.multiplier}
+
+    def policy_step(self, data: TensorDictBase, batch: TensorDictBase) -> dict[str, float]:
+        """The multiplier's step, then passes up the Lagrangian."""
+        measured = self.measure(batch)
+        priced = self.multiplier.react(self, self.measured_levels(measured))
+        advantage = lagrangian(*self.advantages(data, measured), self.multiplier())
+        moved = self.descend(data.copy().set("advantage", in_deviations(advantage)), self.losses_of)
+        return {**moved, **priced, **self.deviations(measured)}
+
+    def losses_of(self, minibatch: TensorDictBase) -> dict[str, Tensor]:
+        """The policy's losses ``loss_*`` on steps whose advantage is that of the Lagrangian.
+
+        ``"advantage"`` is standardised, and has the shape of the steps.
+        """
+        raise NotImplementedError
+
+
+def in_deviations(advantage: Tensor) -> Tensor:
+    """Centred advantages, in units of their standard deviation: what gradient steps expect."""
+    return advantage / advantage.std(correction=0).clamp(min=1e-6)

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-from typing import Any, ClassVar
+from typing import ClassVar
 
 from pydantic import Field
 from tensordict import TensorDictBase
-from torchrl.envs import EnvBase
-from torchrl.objectives import ClipPPOLoss
+from torch import Tensor
 
-from torchrl_safe.objectives import lagrangian
-from torchrl_safe.trainers.on_policy import GradientOptions, GradientTrainer, MeanSurrogateLoss
+from torchrl_safe.objectives.functional import clipped_surrogate
+from torchrl_safe.trainers.on_policy import GradientOptions, MeanSurrogateLoss, PricedTrainer
 from torchrl_safe.trainers.options import MethodOptions, option
-from torchrl_safe.trainers.policy_steps import Controlled, Priced, make_multiplier
+from torchrl_safe.trainers.policy_steps import Controlled, Priced
 
 
 class ClippedLoss(MeanSurrogateLoss):
@@ -33,7 +32,7 @@ class PPOLagrangianOptions(Priced, ClippedOptions):
     method: ClassVar[str] = "ppo_lagrangian"
 
 
-class PPOLagrangian(GradientTrainer):
+class PPOLagrangian(PricedTrainer):
     """Proximal policy optimization of the Lagrangian: clipped ratios on its advantage.
 
     Examples:
@@ -44,25 +43,12 @@ class PPOLagrangian(GradientTrainer):
 
     Options: ClassVar[type[MethodOptions]] = PPOLagrangianOptions
 
-    def build(self, env: EnvBase) -> dict[str, Any]:
-        """A policy with PPO's loss, surrogates with critics of states, and a multiplier."""
-        components = super().build(env)
-        self.policy_loss = ClipPPOLoss(
-            self.policy,
-            clip_epsilon=self.options.loss.clip_epsilon,
-            entropy_bonus=False,
-            normalize_advantage=True,
-        )
-        self.multiplier = make_multiplier(self)
-        return {**components, "multiplier": self.multiplier}
-
-    def policy_step(self, data: TensorDictBase, batch: TensorDictBase) -> dict[str, float]:
-        """The multiplier's step, then passes up the Lagrangian."""
-        measured = self.measure(batch)
-        priced = self.multiplier.react(self, self.measured_levels(measured))
-        advantage = lagrangian(*self.advantages(data, measured), self.multiplier())
-        data = data.copy().set("advantage", advantage.unsqueeze(-1))
-        return {**self.descend(data, self.policy_loss), **priced, **self.deviations(measured)}
+    def losses_of(self, minibatch: TensorDictBase) -> dict[str, Tensor]:
+        """Down minus the clipped surrogate of the Lagrangian."""
+        log_prob = self.policy.get_dist(minibatch).log_prob(minibatch["action"])
+        old, advantage = minibatch["policy_log_prob"], minibatch["advantage"]
+        surrogate = clipped_surrogate(log_prob, old, advantage, self.options.loss.clip_epsilon)
+        return {"loss_policy": -surrogate}
 
 
 class PPOPIDOptions(Controlled, ClippedOptions):

@@ -6,7 +6,7 @@ import mpmath
 import numpy as np
 import pytest
 import torch
-from scipy import stats
+from scipy import optimize, stats
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torch import nn
@@ -18,6 +18,7 @@ from torchrl_safe.modules import divergences
 from torchrl_safe.objectives import functional, value
 from torchrl_safe.objectives.functional import (
     clipped_surrogate,
+    cup_loss,
     cvar_factor,
     discounted_cost_limit,
     focops_loss,
@@ -236,6 +237,61 @@ class TestClippedSurrogate:
             clipped_surrogate(x, x[:2], x, 0.2)
         with pytest.raises(ValueError, match=r"clip_epsilon must be in \(0, 1\), got nan"):
             clipped_surrogate(x, x, x, math.nan)
+
+
+class TestCUP:
+    def test_is_least_at_the_projection(self):
+        """Over all policies of one state, where the optimum follows from one equation."""
+        counts, half = (2, 3, 5), np.array([0.1, 0.4, 0.5])  # tenths of the old policy; pi_1/2
+        old, gamma, lmbda = np.array(counts) / 10, 0.9, 0.8
+        advantage = np.array([[1.0, 0.2], [-1.0, 0.3], [0.5, -0.4]])
+        multiplier = np.array([0.2, 0.1])
+        slope = advantage @ multiplier * (1 - gamma * lmbda) / (1 - gamma)
+        # The slope of -half log(new) + new slope is the same for each action.
+        shift = optimize.brentq(
+            lambda x: (half / (slope + x)).sum() - 1, -slope.min() + 1e-9, 1e3, xtol=1e-14
+        )
+        best = half / (slope + shift)
+        action = torch.arange(3).repeat_interleave(torch.tensor(counts))
+
+        def loss(logits):
+            new = Categorical(logits=logits)
+            return cup_loss(
+                new.logits[action],
+                torch.tensor(np.log(old))[action],
+                kl_divergence(Categorical(torch.tensor(half)), new).expand(10),
+                torch.tensor(advantage)[action],
+                torch.tensor(multiplier),
+                gamma=gamma,
+                lmbda=lmbda,
+            )
+
+        logits = torch.tensor(np.log(best), requires_grad=True)
+        value = loss(logits)
+        expected = (half * np.log(half / best)).sum() + best @ slope
+        assert value.item() == pytest.approx(expected, rel=1e-9)
+        (grad,) = torch.autograd.grad(value, logits)
+        torch.testing.assert_close(grad, torch.zeros_like(grad))
+        for other in 0.3 * np.random.default_rng(0).normal(size=(20, 3)):
+            assert loss(logits.detach() + torch.tensor(other)) > value
+
+    def test_no_gradient_reaches_the_multiplier(self):
+        x, multiplier = torch.zeros(3, requires_grad=True), torch.ones(1, requires_grad=True)
+        cup_loss(x, x, x, torch.ones(3, 1), multiplier, gamma=0.9, lmbda=0.9).backward()
+        assert multiplier.grad is None
+
+    def test_misuse(self):
+        x, costs, prices = torch.zeros(3), torch.zeros(3, 2), torch.zeros(2)
+        for name, args in {
+            "log_pi": (x, x[:2], x, costs, prices),
+            "divergence": (x, x, x[:2], costs, prices),
+            "advantage": (x, x, x, costs, prices[:1]),
+        }.items():
+            with pytest.raises(ValueError, match=rf"{name} must have shape \(3,"):
+                cup_loss(*args, gamma=0.9, lmbda=0.9)
+        for name, wrong in (("gamma", 1.0), ("lmbda", math.nan)):
+            with pytest.raises(ValueError, match=rf"{name} must be in .*, got {wrong}"):
+                cup_loss(x, x, x, costs, prices, **{"gamma": 0.9, "lmbda": 0.9, name: wrong})
 
 
 class TestFOCOPS:

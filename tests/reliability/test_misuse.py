@@ -269,14 +269,29 @@ for name in ("kl_weight", "max_kl"):
         (0.0, -1.0, NAN, INF),
         "positive finite number",
     )
+for name, wrong, allowed in (
+    ("gamma", (-0.1, 1.0, NAN), "in [0, 1)"),
+    ("lmbda", (-0.1, 1.1, NAN), "in [0, 1]"),
+):
+    each(
+        "cup_loss",
+        partial(F.cup_loss, *[zeros(3)] * 3, zeros(3, 2), zeros(2), gamma=0.9, lmbda=0.9),
+        name,
+        wrong,
+        allowed,
+    )
 for name, call in (
     ("clipped_surrogate", lambda: F.clipped_surrogate(zeros(3), zeros(3), zeros(3, 1), 0.2)),
     (
         "focops_loss",
         lambda: F.focops_loss(*[zeros(3)] * 3, zeros(3, 1), kl_weight=1.0, max_kl=0.1),
     ),
+    (
+        "cup_loss",
+        lambda: F.cup_loss(*[zeros(3)] * 3, zeros(3, 1), zeros(2), gamma=0.9, lmbda=0.9),
+    ),
 ):
-    bad(f"{name}: shapes", call, ValueError, "advantage", "(3, 1)", "that of log_prob")
+    bad(f"{name}: shapes", call, ValueError, "advantage", "(3, 1)", "log_prob")
 EYE = torch.eye(2)
 for name, moments in {
     "old_cov": (zeros(2), torch.eye(3), zeros(2), EYE),

@@ -201,6 +201,7 @@ class TestMethods:
             ("ppo_lagrangian", SURROGATE),
             ("trpo_pid", SURROGATE),
             ("focops", SURROGATE),
+            ("cup", SURROGATE),
             ("offpolicy_trc", f"{SURROGATE} {REPLAY}"),
             ("safetac", f"{SURROGATE} {REPLAY} update=pid"),
         ],

@@ -36,6 +36,7 @@ OF_METHOD = {
     "trpo_lagrangian": SURROGATE,
     "trpo_pid": SURROGATE,
     "focops": SURROGATE,
+    "cup": SURROGATE,
     "offpolicy_trc": [*SURROGATE, *REPLAY],
 }
 

@@ -18,6 +18,7 @@ from torchrl_safe._deprecation import moved
 
 __all__ = [
     "clipped_surrogate",
+    "cup_loss",
     "cvar_factor",
     "discounted_cost_limit",
     "focops_loss",
@@ -350,6 +351,66 @@ def focops_loss(
     check_number("max_kl", max_kl, positive=True)
     gain = (log_prob - log_pi).exp() * advantage / kl_weight
     return (divergence - gain).masked_fill(divergence > max_kl, 0).mean()
+
+
+def cup_loss(
+    log_prob: Tensor,
+    log_pi: Tensor,
+    divergence: Tensor,
+    advantage: Tensor,
+    multiplier: Tensor,
+    *,
+    gamma: float,
+    lmbda: float,
+) -> Tensor:
+    r"""Loss of CUP's projection (Yang et al. 2022, https://arxiv.org/abs/2209.07089).
+
+    .. math::
+
+        E\left[\text{KL}_s(\pi_{1/2} \,\|\, \pi') + \frac{1 - \gamma \lambda}{1 - \gamma}
+            \frac{\pi'(a|s)}{\pi(a|s)} \sum_i \nu_i A_{C, i}(s, a)\right]
+
+    ``pi_1/2`` is the policy after a step that followed the return alone. The projection takes back
+    of it what costs more than it is worth at prices ``nu``. The factor is that of the paper's bound
+    on the change of a discounted sum by generalised advantages of trace decay ``lambda``.
+
+    Args:
+        log_prob (Tensor): log-density of the stored action under ``pi'``, ``[*B]``.
+        log_pi (Tensor): under ``pi``, which took it, ``[*B]``.
+        divergence (Tensor): ``KL(pi_1/2 || pi')`` in the state, ``[*B]`` in nats.
+        advantage (Tensor): of the costs, under ``pi``, ``[*B, m]``.
+        multiplier (Tensor): ``nu >= 0``, ``[m]`` in nats per unit of a discounted cost. No gradient
+            flows to it.
+
+    Keyword Args:
+        gamma (float): discount, in [0, 1).
+        lmbda (float): trace decay of the advantages, in [0, 1].
+
+    Returns:
+        The loss, a scalar in nats.
+
+    Raises:
+        ValueError: if shapes disagree, or a coefficient is out of its range.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_safe.objectives.functional import cup_loss
+        >>> log_prob, divergence = torch.zeros(2), torch.tensor([0.0, 0.5])
+        >>> advantage, multiplier = torch.tensor([[1.0], [3.0]]), torch.tensor([0.25])
+        >>> cup_loss(log_prob, log_prob, divergence, advantage, multiplier, gamma=0.75, lmbda=1.0)
+        tensor(0.7500)
+    """
+    shape = log_prob.shape
+    for name, tensor in (("log_pi", log_pi), ("divergence", divergence)):
+        check_shape(name, tensor, shape, "that of log_prob")
+    expected = (*shape, *multiplier.shape[-1:])
+    check_shape("advantage", advantage, expected, "as log_prob and multiplier say")
+    if not 0 <= gamma < 1:
+        raise ValueError(f"gamma must be in [0, 1), got {gamma}.")
+    if not 0 <= lmbda <= 1:
+        raise ValueError(f"lmbda must be in [0, 1], got {lmbda}.")
+    price = (advantage * multiplier.detach()).sum(-1) * (1 - gamma * lmbda) / (1 - gamma)
+    return (divergence + (log_prob - log_pi).exp() * price).mean()
 
 
 def check_entropic_index(entropic_index: float) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from torchrl_safe.trainers.cup import CUP
 from torchrl_safe.trainers.focops import FOCOPS
 from torchrl_safe.trainers.offpolicy_trc import OffPolicyTRC
 from torchrl_safe.trainers.ppo_lagrangian import PPOPID, PPOLagrangian
@@ -18,6 +19,6 @@ METHODS: dict[str, type[Trainer]] = {
         *(SafeTAC, TAC, WCSAC, SACLagrangian, SACPID),
         *(TRC, CPO, OffPolicyTRC),
         *(PPOLagrangian, PPOPID, TRPOLagrangian, TRPOPID),
-        *(FOCOPS,),
+        *(FOCOPS, CUP),
     )
 }

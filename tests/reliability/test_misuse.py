@@ -59,6 +59,7 @@ from torchrl_safe.objectives import (
     PIDMultiplier,
     QuantileCostLoss,
     ReturnSurrogateLoss,
+    exact_penalty,
     lagrangian,
     value,
 )
@@ -335,6 +336,21 @@ bad(
     "multiplier",
     "(3,)",
     "[m]",
+)
+bad(
+    "exact_penalty: shapes",
+    lambda: exact_penalty(zeros(2), zeros(3), 1.0),
+    ValueError,
+    "objective",
+    "(2,)",
+    "[m]",
+)
+each(
+    "exact_penalty",
+    partial(exact_penalty, zeros(), zeros(2)),
+    "penalty",
+    (0.0, -1.0, NAN, INF),
+    "positive finite number",
 )
 
 # Multipliers.
@@ -1631,6 +1647,7 @@ IMPOSSIBLE = {
     "loss.variance_reward": ("none", "'td_error', 'second_moment'"),
     "loss.clip_epsilon": (0.0, "(0, 1)"),
     "loss.kl_weight": (0.0, "(0, inf)"),
+    "loss.penalty": (0.0, "(0, inf)"),
     "loss.entropy_coeff": (-1.0, "[0, inf)"),
     "lagrangian.policy_lr": (0.0, "(0, inf)"),
     "lagrangian.minibatch_size": (0, "at least 1"),

@@ -202,6 +202,7 @@ class TestMethods:
             ("trpo_pid", SURROGATE),
             ("focops", SURROGATE),
             ("cup", SURROGATE),
+            ("p3o", SURROGATE),
             ("offpolicy_trc", f"{SURROGATE} {REPLAY}"),
             ("safetac", f"{SURROGATE} {REPLAY} update=pid"),
         ],

@@ -37,6 +37,7 @@ OF_METHOD = {
     "trpo_pid": SURROGATE,
     "focops": SURROGATE,
     "cup": SURROGATE,
+    "p3o": SURROGATE,
     "offpolicy_trc": [*SURROGATE, *REPLAY],
 }
 

@@ -44,6 +44,7 @@ CASES = {
         name: (name, SURROGATE, {"update/kl", "update/loss_value", "update/multiplier"})
         for name in ("ppo_lagrangian", "ppo_pid", "trpo_lagrangian", "trpo_pid", "focops")
     },
+    "p3o": ("p3o", SURROGATE, {"update/kl", "update/loss_value", "update/cost_level"}),
     "cup": ("cup", SURROGATE, {"update/kl", "update/projection_kl", "update/multiplier"}),
     "offpolicy_trc": ("offpolicy_trc", [*SURROGATE, *REPLAY], {"update/kl", "update/loss_value"}),
     "safetac_lagrangian": (

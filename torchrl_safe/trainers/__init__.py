@@ -10,6 +10,7 @@ from torchrl_safe.trainers.cup import CUP
 from torchrl_safe.trainers.focops import FOCOPS
 from torchrl_safe.trainers.methods import METHODS
 from torchrl_safe.trainers.offpolicy_trc import OffPolicyTRC
+from torchrl_safe.trainers.p3o import P3O
 from torchrl_safe.trainers.ppo_lagrangian import PPOPID, PPOLagrangian
 from torchrl_safe.trainers.safetac import SafeTAC
 from torchrl_safe.trainers.saved_policies import load_policy
@@ -24,6 +25,7 @@ __all__ = [
     "CUP",
     "FOCOPS",
     "METHODS",
+    "P3O",
     "PPOPID",
     "SACPID",
     "TAC",

@@ -9,7 +9,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from torchrl_safe.objectives.functional import cup_loss
-from torchrl_safe.trainers.on_policy import in_deviations
+from torchrl_safe.trainers.on_policy import unit_of
 from torchrl_safe.trainers.options import Lagrangian, MethodOptions
 from torchrl_safe.trainers.ppo_lagrangian import ClippedOptions, PPOLagrangian
 
@@ -38,7 +38,9 @@ class CUP(PPOLagrangian):
         measured = self.measure(batch)
         priced = self.multiplier.react(self, self.measured_levels(measured))
         reward, costs = self.advantages(data, measured)
-        improved = self.descend(data.copy().set("advantage", in_deviations(reward)), self.losses_of)
+        improved = self.descend(
+            data.copy().set("advantage", reward / unit_of(reward)), self.losses_of
+        )
         projected = self.descend(data.copy().set("cost_advantages", costs), self.projection)
         skipped = improved.pop("update/skipped_steps") + projected.pop("update/skipped_steps")
         return {

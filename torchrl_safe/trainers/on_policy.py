@@ -377,7 +377,8 @@ class PricedTrainer(GradientTrainer):
         measured = self.measure(batch)
         priced = self.multiplier.react(self, self.measured_levels(measured))
         advantage = lagrangian(*self.advantages(data, measured), self.multiplier())
-        moved = self.descend(data.copy().set("advantage", in_deviations(advantage)), self.losses_of)
+        advantage = advantage / unit_of(advantage)
+        moved = self.descend(data.copy().set("advantage", advantage), self.losses_of)
         return {**moved, **priced, **self.deviations(measured)}
 
     def losses_of(self, minibatch: TensorDictBase) -> dict[str, Tensor]:
@@ -388,6 +389,6 @@ class PricedTrainer(GradientTrainer):
         raise NotImplementedError
 
 
-def in_deviations(advantage: Tensor) -> Tensor:
-    """Centred advantages, in units of their standard deviation: what gradient steps expect."""
-    return advantage / advantage.std(correction=0).clamp(min=1e-6)
+def unit_of(advantage: Tensor) -> Tensor:
+    """The unit that gradient steps expect advantages in: their standard deviation, a scalar."""
+    return advantage.std(correction=0).clamp(min=1e-6)

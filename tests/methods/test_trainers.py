@@ -40,6 +40,7 @@ CASES = {
     "trpo_lagrangian": (REGION | MULTIPLIER, 100),
     "trpo_pid": (REGION | PID, 100),
     "cup": (GRADIENT | SMALL_STEPS, 100),
+    "crpo": (REGION, 100),
     "p3o": (GRADIENT, 100),
     "focops": (GRADIENT | MULTIPLIER | {"max_kl": 0.05}, 100),
 }
@@ -89,6 +90,6 @@ def test_one_constraint(name):
     check(name, ONE)
 
 
-@pytest.mark.parametrize("name", ["ppo_pid", "trpo_pid", "p3o"])
+@pytest.mark.parametrize("name", ["ppo_pid", "trpo_pid", "p3o", "crpo"])
 def test_two_constraints(name):
     check(name, TWO)

@@ -1648,6 +1648,7 @@ IMPOSSIBLE = {
     "loss.clip_epsilon": (0.0, "(0, 1)"),
     "loss.kl_weight": (0.0, "(0, inf)"),
     "loss.penalty": (0.0, "(0, inf)"),
+    "loss.tolerance": (-0.1, "[0, inf)"),
     "loss.entropy_coeff": (-1.0, "[0, inf)"),
     "lagrangian.policy_lr": (0.0, "(0, inf)"),
     "lagrangian.minibatch_size": (0, "at least 1"),

@@ -203,6 +203,7 @@ class TestMethods:
             ("focops", SURROGATE),
             ("cup", SURROGATE),
             ("p3o", SURROGATE),
+            ("crpo", SURROGATE),
             ("offpolicy_trc", f"{SURROGATE} {REPLAY}"),
             ("safetac", f"{SURROGATE} {REPLAY} update=pid"),
         ],

@@ -38,6 +38,7 @@ OF_METHOD = {
     "focops": SURROGATE,
     "cup": SURROGATE,
     "p3o": SURROGATE,
+    "crpo": SURROGATE,
     "offpolicy_trc": [*SURROGATE, *REPLAY],
 }
 

@@ -6,6 +6,7 @@ from torchrl_safe._extras import need
 
 need("training", "train", "hydra", "imageio", "matplotlib", "pydantic", "tqdm")
 
+from torchrl_safe.trainers.crpo import CRPO
 from torchrl_safe.trainers.cup import CUP
 from torchrl_safe.trainers.focops import FOCOPS
 from torchrl_safe.trainers.methods import METHODS
@@ -22,6 +23,7 @@ from torchrl_safe.trainers.wcsac import SACPID, WCSAC, SACLagrangian
 
 __all__ = [
     "CPO",
+    "CRPO",
     "CUP",
     "FOCOPS",
     "METHODS",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from torchrl_safe.trainers.crpo import CRPO
 from torchrl_safe.trainers.cup import CUP
 from torchrl_safe.trainers.focops import FOCOPS
 from torchrl_safe.trainers.offpolicy_trc import OffPolicyTRC
@@ -20,6 +21,6 @@ METHODS: dict[str, type[Trainer]] = {
         *(SafeTAC, TAC, WCSAC, SACLagrangian, SACPID),
         *(TRC, CPO, OffPolicyTRC),
         *(PPOLagrangian, PPOPID, TRPOLagrangian, TRPOPID),
-        *(FOCOPS, CUP, P3O),
+        *(FOCOPS, CUP, P3O, CRPO),
     )
 }

@@ -41,6 +41,7 @@ CASES = {
     "trpo_pid": (REGION | PID, 100),
     "cup": (GRADIENT | SMALL_STEPS, 100),
     "crpo": (REGION, 100),
+    "pcpo": (REGION, 60),
     "p3o": (GRADIENT, 100),
     "focops": (GRADIENT | MULTIPLIER | {"max_kl": 0.05}, 100),
 }
@@ -90,6 +91,6 @@ def test_one_constraint(name):
     check(name, ONE)
 
 
-@pytest.mark.parametrize("name", ["ppo_pid", "trpo_pid", "p3o", "crpo"])
+@pytest.mark.parametrize("name", ["ppo_pid", "trpo_pid", "p3o", "crpo", "pcpo"])
 def test_two_constraints(name):
     check(name, TWO)

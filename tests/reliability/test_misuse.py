@@ -987,6 +987,7 @@ each("TrustRegionSafeOptimizer", make_optimizer, "backtrack_ratio", (0.0, 1.0, N
 each("TrustRegionSafeOptimizer", make_optimizer, "max_backtracks", (-1, 0.5), "at least 0")
 each("TrustRegionSafeOptimizer", make_optimizer, "recovery_ratio", (0.0, 1.1, NAN), "in (0, 1]")
 each("TrustRegionSafeOptimizer", make_optimizer, "statistics_kl", (3,), "callable", TypeError)
+each("TrustRegionSafeOptimizer", make_optimizer, "projection", (1,), "True or False", TypeError)
 each("TrustRegionSafeOptimizer", make_optimizer, "cuda_graph", (1,), "True or False", TypeError)
 each("TrustRegionSafeOptimizer", make_optimizer, "cuda_graph", (True,), "on a CUDA device, got cpu")
 bad(

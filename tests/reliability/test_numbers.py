@@ -204,6 +204,7 @@ class TestMethods:
             ("cup", SURROGATE),
             ("p3o", SURROGATE),
             ("crpo", SURROGATE),
+            ("pcpo", SURROGATE),
             ("offpolicy_trc", f"{SURROGATE} {REPLAY}"),
             ("safetac", f"{SURROGATE} {REPLAY} update=pid"),
         ],

@@ -39,6 +39,7 @@ OF_METHOD = {
     "cup": SURROGATE,
     "p3o": SURROGATE,
     "crpo": SURROGATE,
+    "pcpo": SURROGATE,
     "offpolicy_trc": [*SURROGATE, *REPLAY],
 }
 

@@ -44,6 +44,7 @@ CASES = {
         name: (name, SURROGATE, {"update/kl", "update/loss_value", "update/multiplier"})
         for name in ("ppo_lagrangian", "ppo_pid", "trpo_lagrangian", "trpo_pid", "focops")
     },
+    "pcpo": ("pcpo", SURROGATE, {"update/kl", "update/loss_cost_value", "update/cost_level"}),
     "crpo": ("crpo", SURROGATE, {"update/kl", "update/cost_level", "update/lowers_cost"}),
     "p3o": ("p3o", SURROGATE, {"update/kl", "update/loss_value", "update/cost_level"}),
     "cup": ("cup", SURROGATE, {"update/kl", "update/projection_kl", "update/multiplier"}),

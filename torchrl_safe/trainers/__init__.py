@@ -12,6 +12,7 @@ from torchrl_safe.trainers.focops import FOCOPS
 from torchrl_safe.trainers.methods import METHODS
 from torchrl_safe.trainers.offpolicy_trc import OffPolicyTRC
 from torchrl_safe.trainers.p3o import P3O
+from torchrl_safe.trainers.pcpo import PCPO
 from torchrl_safe.trainers.ppo_lagrangian import PPOPID, PPOLagrangian
 from torchrl_safe.trainers.safetac import SafeTAC
 from torchrl_safe.trainers.saved_policies import load_policy
@@ -28,6 +29,7 @@ __all__ = [
     "FOCOPS",
     "METHODS",
     "P3O",
+    "PCPO",
     "PPOPID",
     "SACPID",
     "TAC",

@@ -9,10 +9,9 @@ from pydantic import Field
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
-from torchrl_safe.trainers.on_policy import MeanSurrogateLoss, TrustRegionTrainer
+from torchrl_safe.trainers.on_policy import KLOptions, MeanSurrogateLoss, TrustRegionTrainer
 from torchrl_safe.trainers.options import MethodOptions, option
 from torchrl_safe.trainers.trainer import discounted_unit
-from torchrl_safe.trainers.trpo_lagrangian import KLOptions
 
 
 class CRPOLoss(MeanSurrogateLoss):

@@ -9,9 +9,9 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from torchrl_safe.objectives.functional import cup_loss
-from torchrl_safe.trainers.on_policy import unit_of
+from torchrl_safe.trainers.on_policy import ClippedOptions, unit_of
 from torchrl_safe.trainers.options import Lagrangian, MethodOptions
-from torchrl_safe.trainers.ppo_lagrangian import ClippedOptions, PPOLagrangian
+from torchrl_safe.trainers.ppo_lagrangian import PPOLagrangian
 
 
 class CUPOptions(ClippedOptions):

@@ -7,6 +7,7 @@ from torchrl_safe.trainers.cup import CUP
 from torchrl_safe.trainers.focops import FOCOPS
 from torchrl_safe.trainers.offpolicy_trc import OffPolicyTRC
 from torchrl_safe.trainers.p3o import P3O
+from torchrl_safe.trainers.pcpo import PCPO
 from torchrl_safe.trainers.ppo_lagrangian import PPOPID, PPOLagrangian
 from torchrl_safe.trainers.safetac import SafeTAC
 from torchrl_safe.trainers.tac import TAC
@@ -21,6 +22,6 @@ METHODS: dict[str, type[Trainer]] = {
         *(SafeTAC, TAC, WCSAC, SACLagrangian, SACPID),
         *(TRC, CPO, OffPolicyTRC),
         *(PPOLagrangian, PPOPID, TRPOLagrangian, TRPOPID),
-        *(FOCOPS, CUP, P3O, CRPO),
+        *(FOCOPS, CUP, P3O, CRPO, PCPO),
     )
 }

@@ -82,13 +82,13 @@ class SurrogateCritics(Group):
 
 
 class KLOptim(KLRegion, SurrogateCritics):
-    """Critics and a trust-region step without constraints."""
+    """Critics and a trust-region step."""
 
     damping: float = again(KLRegion, "damping", 0.1)
 
 
 class SurrogateOptim(TrustRegion, KLOptim):
-    """Critics and the trust-region step."""
+    """Critics and a trust-region step under constraints."""
 
     recovery_ratio: float = again(TrustRegion, "recovery_ratio", 1.0)
 
@@ -133,6 +133,24 @@ class GradientOptions(OnPolicyOptions):
     """The options of on-policy methods of gradient steps."""
 
     optim: GradientOptim = Field(default_factory=GradientOptim)
+
+
+class ClippedLoss(MeanSurrogateLoss):
+    """Reward, the limit, and how far a ratio may go."""
+
+    clip_epsilon: float = option(0.2, "ratios beyond 1 +- this gain nothing", gt=0, lt=1)
+
+
+class ClippedOptions(GradientOptions):
+    """The options of on-policy methods with clipped ratios."""
+
+    loss: ClippedLoss = Field(default_factory=ClippedLoss)
+
+
+class KLOptions(OnPolicyOptions):
+    """The options of on-policy methods whose trust-region step makes no room for recovery."""
+
+    optim: KLOptim = Field(default_factory=KLOptim)
 
 
 class SurrogateTrainer(ConstrainedTrainer):
@@ -253,12 +271,17 @@ class TrustRegionTrainer(SurrogateTrainer):
     """A trust region on surrogates of return and costs."""
 
     Options: ClassVar[type[MethodOptions]] = SurrogateOptions
+    projection: ClassVar[bool] = False  # whether a step follows the return and is then projected
 
     def build(self, env: EnvBase) -> dict[str, Any]:
         """A policy, surrogates with critics of states, and the trust region."""
         components = super().build(env)
         self.trust_region = make_trust_region(
-            self.options.optim, self.policy, self.distance, self.options.device
+            self.options.optim,
+            self.policy,
+            self.distance,
+            self.options.device,
+            projection=self.projection,
         )
         return {**components, "policy_optim": self.trust_region}
 

@@ -12,9 +12,8 @@ from torch import Tensor
 
 from torchrl_safe.objectives import exact_penalty
 from torchrl_safe.objectives.functional import clipped_surrogate
-from torchrl_safe.trainers.on_policy import GradientTrainer, unit_of
+from torchrl_safe.trainers.on_policy import ClippedLoss, ClippedOptions, GradientTrainer, unit_of
 from torchrl_safe.trainers.options import MethodOptions, option
-from torchrl_safe.trainers.ppo_lagrangian import ClippedLoss, ClippedOptions
 
 
 class P3OLoss(ClippedLoss):

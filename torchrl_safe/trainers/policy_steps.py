@@ -55,7 +55,12 @@ class Controlled(Group):
 
 
 def make_trust_region(
-    options: KLRegion, policy: nn.Module, distance: Distance, device: str
+    options: KLRegion,
+    policy: nn.Module,
+    distance: Distance,
+    device: str,
+    *,
+    projection: bool = False,
 ) -> TrustRegionSafeOptimizer:
     """The optimizer of the policy, with the options' numbers."""
     return TrustRegionSafeOptimizer(
@@ -66,6 +71,7 @@ def make_trust_region(
         backtrack_ratio=options.backtrack_ratio,
         max_backtracks=options.max_backtracks,
         recovery_ratio=options.recovery_ratio if isinstance(options, TrustRegion) else 1.0,
+        projection=projection,
         statistics_kl=distance.kl,
         cuda_graph=options.cuda_graphs and torch.device(device).type == "cuda",
     )

@@ -4,26 +4,13 @@ from __future__ import annotations
 
 from typing import ClassVar
 
-from pydantic import Field
 from tensordict import TensorDictBase
 from torch import Tensor
 
 from torchrl_safe.objectives.functional import clipped_surrogate
-from torchrl_safe.trainers.on_policy import GradientOptions, MeanSurrogateLoss, PricedTrainer
-from torchrl_safe.trainers.options import MethodOptions, option
+from torchrl_safe.trainers.on_policy import ClippedOptions, PricedTrainer
+from torchrl_safe.trainers.options import MethodOptions
 from torchrl_safe.trainers.policy_steps import Controlled, Priced
-
-
-class ClippedLoss(MeanSurrogateLoss):
-    """Reward, the limit, and how far a ratio may go."""
-
-    clip_epsilon: float = option(0.2, "ratios beyond 1 +- this gain nothing", gt=0, lt=1)
-
-
-class ClippedOptions(GradientOptions):
-    """What the options of methods with clipped ratios have."""
-
-    loss: ClippedLoss = Field(default_factory=ClippedLoss)
 
 
 class PPOLagrangianOptions(Priced, ClippedOptions):

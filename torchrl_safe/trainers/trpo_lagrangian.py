@@ -4,20 +4,13 @@ from __future__ import annotations
 
 from typing import Any, ClassVar
 
-from pydantic import Field
 from tensordict import TensorDict, TensorDictBase
 from torchrl.envs import EnvBase
 
 from torchrl_safe.objectives import lagrangian
-from torchrl_safe.trainers.on_policy import KLOptim, OnPolicyOptions, TrustRegionTrainer
+from torchrl_safe.trainers.on_policy import KLOptions, TrustRegionTrainer
 from torchrl_safe.trainers.options import MethodOptions
 from torchrl_safe.trainers.policy_steps import Controlled, Priced, make_multiplier
-
-
-class KLOptions(OnPolicyOptions):
-    """What the options of methods with a trust region without constraints have."""
-
-    optim: KLOptim = Field(default_factory=KLOptim)
 
 
 class TRPOLagrangianOptions(Priced, KLOptions):

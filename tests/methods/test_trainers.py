@@ -28,6 +28,8 @@ COMMON = {
 }
 GRADIENT = {"policy_lr": 0.03, "num_epochs": 3, "max_kl": 1.0}
 MULTIPLIER = {"lagrangian.init": 1.0, "lagrangian.lr": 0.3}
+# Of CUP: its price is in nats, and it takes two steps of that size in an update.
+SMALL_STEPS = {"policy_lr": 0.02, "max_kl": 0.005, "lagrangian.init": 4.0, "lagrangian.lr": 0.5}
 PID = {"lagrangian.init": 1.0, "kp": 1.0, "ki": 0.2, "kd": 1.0}
 REGION = {"max_kl": 0.02, "damping": 0.01, "cg_iters": 5}
 
@@ -37,6 +39,11 @@ CASES = {
     "ppo_pid": (GRADIENT | PID, 100),
     "trpo_lagrangian": (REGION | MULTIPLIER, 100),
     "trpo_pid": (REGION | PID, 100),
+    "cup": (GRADIENT | SMALL_STEPS, 100),
+    "crpo": (REGION, 100),
+    "pcpo": (REGION, 60),
+    "p3o": (GRADIENT, 100),
+    "focops": (GRADIENT | MULTIPLIER | {"max_kl": 0.05}, 100),
 }
 
 
@@ -84,6 +91,6 @@ def test_one_constraint(name):
     check(name, ONE)
 
 
-@pytest.mark.parametrize("name", ["ppo_pid", "trpo_pid"])
+@pytest.mark.parametrize("name", ["ppo_pid", "trpo_pid", "p3o", "crpo", "pcpo"])
 def test_two_constraints(name):
     check(name, TWO)

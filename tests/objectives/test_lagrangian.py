@@ -8,7 +8,12 @@ import numpy as np
 import pytest
 import torch
 
-from torchrl_safe.objectives import LagrangeMultiplier, PIDMultiplier, lagrangian
+from torchrl_safe.objectives import (
+    LagrangeMultiplier,
+    PIDMultiplier,
+    exact_penalty,
+    lagrangian,
+)
 
 
 class TestLagrangian:
@@ -58,6 +63,35 @@ class TestLagrangian:
     def test_shapes(self, objective, constraint, multiplier):
         with pytest.raises(ValueError, match="must have shapes"):
             lagrangian(torch.zeros(objective), torch.zeros(constraint), torch.zeros(multiplier))
+
+
+class TestExactPenalty:
+    @pytest.mark.parametrize(("penalty", "best"), [(0.5, 1.25), (1.05, 1.0), (20.0, 1.0)])
+    def test_is_exact_above_the_multiplier(self, penalty, best):
+        """3 x - x^2 below 1, where its slope, the multiplier, is 1; the second one never binds."""
+        grid = torch.linspace(0, 3, 601, dtype=torch.float64)
+        values = [
+            exact_penalty(3 * x - x.square(), torch.stack([x - 1, x / 2 - 2]), penalty)
+            for x in grid
+        ]
+        assert grid[torch.stack(values).argmax()].item() == pytest.approx(best)
+
+    def test_violations_add_up(self):
+        x = torch.tensor([2.0, -1.0, 0.5], requires_grad=True)
+        value = exact_penalty(x.sum(), x, 3.0)
+        assert value.item() == pytest.approx(1.5 - 3 * 2.5)
+        value.backward()
+        assert x.grad.tolist() == [-2.0, 1.0, -2.0]
+
+    @pytest.mark.parametrize(("objective", "constraint"), [((1,), (1,)), ((), ())])
+    def test_shapes(self, objective, constraint):
+        with pytest.raises(ValueError, match="must have shapes"):
+            exact_penalty(torch.zeros(objective), torch.zeros(constraint), 1.0)
+
+    @pytest.mark.parametrize("penalty", [0.0, math.inf, math.nan])
+    def test_a_penalty_that_is_none(self, penalty):
+        with pytest.raises(ValueError, match=f"penalty must be .*, got {penalty}"):
+            exact_penalty(torch.zeros(()), torch.zeros(1), penalty)
 
 
 class TestLagrangeMultiplier:

@@ -6,13 +6,22 @@ import mpmath
 import numpy as np
 import pytest
 import torch
-from scipy import stats
+from scipy import optimize, stats
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModule
+from torch import nn
+from torch.distributions import Categorical, kl_divergence
+from torchrl.modules import ProbabilisticActor
+from torchrl.objectives import ClipPPOLoss
 
 from torchrl_safe.modules import divergences
 from torchrl_safe.objectives import functional, value
 from torchrl_safe.objectives.functional import (
+    clipped_surrogate,
+    cup_loss,
     cvar_factor,
     discounted_cost_limit,
+    focops_loss,
     gaussian_cvar,
     q_logarithm,
     surrogate_change,
@@ -195,6 +204,153 @@ class TestSurrogateChange:
         for gamma in (-0.1, 1.0, math.nan):
             with pytest.raises(ValueError, match=rf"gamma must be in \[0, 1\), got {gamma}"):
                 surrogate_change(x, x, x, x, gamma)
+
+
+class TestClippedSurrogate:
+    def test_equals_that_of_torchrl(self):
+        torch.manual_seed(0)
+        logits = TensorDictModule(nn.Linear(3, 4), ["observation"], ["logits"])
+        actor = ProbabilisticActor(logits, in_keys=["logits"], distribution_class=Categorical)
+        action, log_pi = torch.randint(4, (200,)), 0.5 * torch.randn(200) - 1.4
+        data = TensorDict(
+            {
+                "observation": torch.randn(200, 3),
+                "action": action,
+                "action_log_prob": log_pi,
+                "advantage": torch.randn(200, 1),
+            },
+            [200],
+        )
+        loss = ClipPPOLoss(actor, clip_epsilon=0.3, entropy_bonus=False)(data)["loss_objective"]
+        log_prob = actor.get_dist(data).log_prob(action)
+        ratio = (log_prob - log_pi).exp()
+        assert ((ratio < 0.7) | (ratio > 1.3)).float().mean() > 0.2
+        own = clipped_surrogate(log_prob, log_pi, data["advantage"].squeeze(-1), 0.3)
+        torch.testing.assert_close(own, -loss)
+        weights = list(logits.parameters())
+        expected, actual = (torch.autograd.grad(value, weights) for value in (-loss, own))
+        torch.testing.assert_close(actual, expected)
+
+    def test_misuse(self):
+        x = torch.zeros(3)
+        with pytest.raises(ValueError, match=r"log_pi must have shape \(3,\), that of log_prob"):
+            clipped_surrogate(x, x[:2], x, 0.2)
+        with pytest.raises(ValueError, match=r"clip_epsilon must be in \(0, 1\), got nan"):
+            clipped_surrogate(x, x, x, math.nan)
+
+
+class TestCUP:
+    def test_is_least_at_the_projection(self):
+        """Over all policies of one state, where the optimum follows from one equation."""
+        counts, half = (2, 3, 5), np.array([0.1, 0.4, 0.5])  # tenths of the old policy; pi_1/2
+        old, gamma, lmbda = np.array(counts) / 10, 0.9, 0.8
+        advantage = np.array([[1.0, 0.2], [-1.0, 0.3], [0.5, -0.4]])
+        multiplier = np.array([0.2, 0.1])
+        slope = advantage @ multiplier * (1 - gamma * lmbda) / (1 - gamma)
+        # The slope of -half log(new) + new slope is the same for each action.
+        shift = optimize.brentq(
+            lambda x: (half / (slope + x)).sum() - 1, -slope.min() + 1e-9, 1e3, xtol=1e-14
+        )
+        best = half / (slope + shift)
+        action = torch.arange(3).repeat_interleave(torch.tensor(counts))
+
+        def loss(logits):
+            new = Categorical(logits=logits)
+            return cup_loss(
+                new.logits[action],
+                torch.tensor(np.log(old))[action],
+                kl_divergence(Categorical(torch.tensor(half)), new).expand(10),
+                torch.tensor(advantage)[action],
+                torch.tensor(multiplier),
+                gamma=gamma,
+                lmbda=lmbda,
+            )
+
+        logits = torch.tensor(np.log(best), requires_grad=True)
+        value = loss(logits)
+        expected = (half * np.log(half / best)).sum() + best @ slope
+        assert value.item() == pytest.approx(expected, rel=1e-9)
+        (grad,) = torch.autograd.grad(value, logits)
+        torch.testing.assert_close(grad, torch.zeros_like(grad))
+        for other in 0.3 * np.random.default_rng(0).normal(size=(20, 3)):
+            assert loss(logits.detach() + torch.tensor(other)) > value
+
+    def test_no_gradient_reaches_the_multiplier(self):
+        x, multiplier = torch.zeros(3, requires_grad=True), torch.ones(1, requires_grad=True)
+        cup_loss(x, x, x, torch.ones(3, 1), multiplier, gamma=0.9, lmbda=0.9).backward()
+        assert multiplier.grad is None
+
+    def test_misuse(self):
+        x, costs, prices = torch.zeros(3), torch.zeros(3, 2), torch.zeros(2)
+        for name, args in {
+            "log_pi": (x, x[:2], x, costs, prices),
+            "divergence": (x, x, x[:2], costs, prices),
+            "advantage": (x, x, x, costs, prices[:1]),
+        }.items():
+            with pytest.raises(ValueError, match=rf"{name} must have shape \(3,"):
+                cup_loss(*args, gamma=0.9, lmbda=0.9)
+        for name, wrong in (("gamma", 1.0), ("lmbda", math.nan)):
+            with pytest.raises(ValueError, match=rf"{name} must be in .*, got {wrong}"):
+                cup_loss(x, x, x, costs, prices, **{"gamma": 0.9, "lmbda": 0.9, name: wrong})
+
+
+class TestFOCOPS:
+    OLD = ((2, 3, 5), (6, 3, 1))  # tenths, by state
+    ADVANTAGE = torch.tensor([[1.0, -2.0, 0.8], [-0.5, 0.5, 1.5]], dtype=torch.float64)
+    WEIGHT = 1.5
+
+    def policies(self):
+        """The old one, and a new one by its logits."""
+        old = torch.tensor(self.OLD, dtype=torch.float64) / 10
+        logits = torch.tensor([[0.1, 0.2, 0.4], [1.5, 0.0, -0.9]], dtype=torch.float64)
+        return Categorical(old), logits.requires_grad_()
+
+    def loss(self, old, logits, max_kl):
+        """On a batch that has every action as often as the old policy takes it."""
+        new, state = Categorical(logits=logits), torch.arange(2).repeat_interleave(10)
+        action = torch.cat([torch.arange(3).repeat_interleave(torch.tensor(n)) for n in self.OLD])
+        return focops_loss(
+            new.logits[state, action],
+            old.logits[state, action],
+            kl_divergence(new, old)[state],
+            self.ADVANTAGE[state, action],
+            kl_weight=self.WEIGHT,
+            max_kl=max_kl,
+        )
+
+    def expected(self, old, logits):
+        """Divergence, by state, from what solves the trust-region problem over all policies."""
+        best = old.probs * (self.ADVANTAGE / self.WEIGHT).exp()
+        return kl_divergence(Categorical(logits=logits), Categorical(best))
+
+    def test_gradient_is_that_of_the_divergence_from_the_best_policy(self):
+        old, logits = self.policies()
+        (actual,) = torch.autograd.grad(self.loss(old, logits, max_kl=10.0), logits)
+        (expected,) = torch.autograd.grad(self.expected(old, logits).mean(), logits)
+        torch.testing.assert_close(actual, expected)
+
+    def test_a_state_outside_the_region_adds_nothing(self):
+        old, logits = self.policies()
+        near, far = kl_divergence(Categorical(logits=logits), old).tolist()
+        assert near < far
+        loss = self.loss(old, logits, max_kl=(near + far) / 2)
+        (actual,) = torch.autograd.grad(loss, logits)
+        (expected,) = torch.autograd.grad(self.expected(old, logits)[0] / 2, logits)
+        torch.testing.assert_close(actual, expected)
+        assert (actual[0] != 0).all()
+        assert (actual[1] == 0).all()
+
+    def test_misuse(self):
+        x = torch.zeros(3)
+        for position, name in enumerate(("log_pi", "divergence", "advantage"), 1):
+            args = [x] * 4
+            args[position] = x[:2]
+            with pytest.raises(ValueError, match=rf"{name} must have shape \(3,\), that of log_"):
+                focops_loss(*args, kl_weight=1.0, max_kl=0.1)
+        for name in ("kl_weight", "max_kl"):
+            numbers = {"kl_weight": 1.0, "max_kl": 0.1, name: 0.0}
+            with pytest.raises(ValueError, match=rf"{name} must be .*, got 0"):
+                focops_loss(x, x, x, x, **numbers)
 
 
 @pytest.mark.parametrize(

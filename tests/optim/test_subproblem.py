@@ -4,9 +4,9 @@ import math
 
 import numpy as np
 import pytest
-from scipy.optimize import minimize
+from scipy.optimize import minimize, nnls
 
-from torchrl_safe.optim.subproblem import MAX_CONSTRAINTS, solve_subproblem
+from torchrl_safe.optim.subproblem import MAX_CONSTRAINTS, project_step, solve_subproblem
 
 
 class Problem:
@@ -453,3 +453,75 @@ def test_misuse():
     m = MAX_CONSTRAINTS + 1
     with pytest.raises(ValueError, match=f"at most {MAX_CONSTRAINTS} constraints .* got {m}"):
         solve_subproblem(1.0, np.zeros(m), np.eye(m), np.zeros(m), 0.5)
+
+
+class TestProjection:
+    """PCPO's step, in the space of the parameters."""
+
+    def project(self, p):
+        return project_step(p.q, p.r, p.s, p.c, p.delta)
+
+    def radii(self, p, x):
+        """The length of a step, of which the region has 1."""
+        return math.sqrt(x @ p.h @ x / (2 * p.delta))
+
+    def test_one_constraint_matches_the_papers_closed_form(self):
+        rng = np.random.default_rng(0)
+        cases = dict.fromkeys(("inert", "feasible", "recoverable", "infeasible"), 0)
+        for _ in range(1000):
+            p = Problem(rng, 1)
+            up = math.sqrt(2 * p.delta / p.q) * p.inverse @ p.g
+            beyond = max(0.0, (p.b[0] @ up + p.c[0]) / p.s[0, 0])
+            expected = up - beyond * p.inverse @ p.b[0]
+            length = self.radii(p, expected)
+            solution = self.project(p)
+            cases[solution.case] += 1
+            assert (solution.case == "infeasible") == (length > 1 + 1e-6 and p.c[0] > 0)
+            assert self.radii(p, p.step(solution) - expected / max(1, length)) < 1e-9
+        assert min(cases.values()) > 100, cases
+
+    @pytest.mark.parametrize("m", [2, 3])
+    def test_several_constraints_match_least_distance_programming(self, m):
+        rng = np.random.default_rng(m)
+        moved = 0
+        for _ in range(200):
+            p = Problem(rng, m)
+            v0, v, d, chol = in_radii(p)
+            # Lawson and Hanson's least distance: z nearest to 0 with -v z >= d + v v0.
+            system, target = np.vstack([-v.T, d + v @ v0]), np.eye(len(v0) + 1)[-1]
+            weights, _ = nnls(system, target)
+            residual = system @ weights - target
+            shift = -residual[:-1] / residual[-1]
+            moved += np.linalg.norm(shift) > 0.1
+            expected = (v0 + shift) / max(1, np.linalg.norm(v0 + shift))
+            actual = chol.T @ p.step(self.project(p))
+            np.testing.assert_allclose(actual, expected, atol=1e-6)
+        assert moved > 100
+
+    def test_a_step_from_where_all_hold_does_not_lower_the_objective(self):
+        rng = np.random.default_rng(5)
+        for _ in range(500):
+            p = Problem(rng, 3, violation=rng.uniform(-1, 0, size=3))
+            x = p.step(self.project(p))
+            assert p.g @ x >= 0
+            assert (p.b @ x + p.c <= 1e-6 * p.reach).all()
+
+    @pytest.mark.parametrize(
+        ("r", "s", "c"),
+        [
+            ([0.0, 0.0], [[1.0, -1.0], [-1.0, 1.0]], [0.5, 0.5]),  # opposed
+            ([0.0], [[0.0]], [0.5]),  # without a gradient
+        ],
+    )
+    def test_constraints_that_nothing_satisfies(self, r, s, c):
+        solution = project_step(1.0, r, s, c, max_kl=0.5)
+        assert solution.case == "rejected"
+        assert solution.reason == "no step satisfies all constraints"
+        assert solution.objective_weight == 0
+        assert not solution.constraint_weight.any()
+
+    def test_a_violation_far_outside_the_region_is_followed(self):
+        solution = project_step(1.0, [0.0], [[1e-12]], [1e6], max_kl=0.5)
+        assert solution.case == "infeasible"
+        assert solution.constraint_weight[0] * 1e-6 == pytest.approx(1.0)
+        assert solution.objective_weight == pytest.approx(0.0, abs=1e-6)

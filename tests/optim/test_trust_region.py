@@ -143,6 +143,18 @@ def test_several_constraints():
     assert report.constraint_change == pytest.approx((0.1, 0.2))
 
 
+def test_a_projection_follows_the_objective_first():
+    x = parameter(0.5, 0.0)
+    optim = optimizer(x, max_kl=0.5, projection=True)
+    closure = Recorder(x, lambda x: x.sum(), lambda x: x[:1] - 0.6)
+    report = optim.step(closure)
+    assert report.case == "feasible"
+    # One radius up the diagonal, and straight back to the limit: the region is not used up.
+    expected = torch.tensor([0.6, math.sqrt(0.5)]).double()
+    torch.testing.assert_close(x.detach(), expected, atol=1e-6, rtol=0)
+    assert report.kl == pytest.approx((0.1**2 + 0.5) / 2)
+
+
 @pytest.mark.parametrize("m", [0, 1, 2])
 @pytest.mark.parametrize("cg_iters", [1, 3])
 def test_predictions_and_region_are_exact_however_few_the_cg_iterations(m, cg_iters):
@@ -468,13 +480,14 @@ def module_kl(old, new):
 
 def test_state_dict_pickle_and_deepcopy_keep_settings_and_the_kl():
     x = parameter(0.0)
-    optim = optimizer(x, statistics_kl=module_kl, max_kl=0.07, recovery_ratio=0.5)
+    optim = optimizer(x, statistics_kl=module_kl, max_kl=0.07, recovery_ratio=0.5, projection=True)
     other = optimizer(parameter(1.0))
     other.load_state_dict(optim.state_dict())
     assert other.param_groups[0]["max_kl"] == 0.07
     assert other.param_groups[0]["recovery_ratio"] == 0.5
     for clone in (pickle.loads(pickle.dumps(optim)), copy.deepcopy(optim)):
         assert clone.statistics_kl is module_kl
+        assert clone.projection
         y = clone.param_groups[0]["params"][0]
         assert clone.step(Recorder(y, lambda x: x.sum())).accepted
         assert y.item() == pytest.approx(math.sqrt(0.14))

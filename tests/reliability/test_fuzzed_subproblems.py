@@ -12,9 +12,9 @@ import warnings
 
 import numpy as np
 import pytest
-from scipy.optimize import minimize, nnls
+from scipy.optimize import linprog, minimize, nnls
 
-from torchrl_safe.optim.subproblem import solve_subproblem
+from torchrl_safe.optim.subproblem import project_step, solve_subproblem
 
 CASES = ("unconstrained", "inert", "feasible", "recoverable", "infeasible", "rejected")
 
@@ -52,9 +52,15 @@ class Problem:
         self.c = distance * np.where(self.norm > 0, self.norm * self.radius, 1)
         self.ratio = rng.choice([1.0, 0.7, 0.1])
 
+    @property
+    def products(self):
+        return self.g @ self.g, self.b @ self.g, self.b @ self.b.T, self.c, self.delta
+
     def solve(self):
-        q, r, s = self.g @ self.g, self.b @ self.g, self.b @ self.b.T
-        return solve_subproblem(q, r, s, self.c, self.delta, self.ratio)
+        return solve_subproblem(*self.products, self.ratio)
+
+    def project(self):
+        return project_step(*self.products)
 
     def step(self, solution) -> np.ndarray:
         """In radii of the region, [n]."""
@@ -125,6 +131,33 @@ def test_every_answer_is_safe_and_optimal(count):
         slowest = max(slowest, time.process_time() - start)
     assert all(number > count // 200 for number in seen.values()), seen
     assert slowest < 1.0  # of this process's own time: no hang
+
+
+@pytest.mark.parametrize("count", [2000, pytest.param(100_000, marks=pytest.mark.long)])
+def test_every_projection_is_safe(count):
+    """And there is one wherever a linear program finds a point that satisfies all constraints."""
+    rng = np.random.default_rng(2)
+    seen = dict.fromkeys(CASES, 0)
+    for _ in range(count):
+        problem = Problem(rng)
+        solution = problem.project()
+        seen[solution.case] += 1
+        x = problem.step(solution)
+        normals, distance = problem.scaled
+        if solution.case == "rejected":
+            flat = problem.c[problem.norm == 0] > 0
+            none = linprog(np.zeros_like(x), normals, -distance - 1e-6, bounds=(None, None))
+            assert flat.any() or none.status == 2
+            assert not x.any()
+            continue
+        after = distance + normals @ x
+        assert np.linalg.norm(x) <= 1 + 1e-6
+        assert (after <= np.maximum(distance, 0) + 1e-6).all()
+        if solution.case == "infeasible":
+            assert np.linalg.norm(x) >= 1 - 1e-6
+        else:
+            assert (after <= 1e-5).all()
+    assert all(number > count // 200 for number in seen.values()), seen
 
 
 def test_no_answer_is_worse_than_a_general_solver_s():

@@ -60,6 +60,7 @@ from torchrl_safe.objectives import (
     PIDMultiplier,
     QuantileCostLoss,
     ReturnSurrogateLoss,
+    exact_penalty,
     lagrangian,
     value,
 )
@@ -255,6 +256,44 @@ bad(
     "(3, 1)",
     "that of log_prob",
 )
+each(
+    "clipped_surrogate",
+    partial(F.clipped_surrogate, zeros(3), zeros(3), zeros(3)),
+    "clip_epsilon",
+    (0.0, 1.0, NAN),
+    "in (0, 1)",
+)
+for name in ("kl_weight", "max_kl"):
+    each(
+        "focops_loss",
+        partial(F.focops_loss, *[zeros(3)] * 4, kl_weight=1.0, max_kl=0.1),
+        name,
+        (0.0, -1.0, NAN, INF),
+        "positive finite number",
+    )
+for name, wrong, allowed in (
+    ("gamma", (-0.1, 1.0, NAN), "in [0, 1)"),
+    ("lmbda", (-0.1, 1.1, NAN), "in [0, 1]"),
+):
+    each(
+        "cup_loss",
+        partial(F.cup_loss, *[zeros(3)] * 3, zeros(3, 2), zeros(2), gamma=0.9, lmbda=0.9),
+        name,
+        wrong,
+        allowed,
+    )
+for name, call in (
+    ("clipped_surrogate", lambda: F.clipped_surrogate(zeros(3), zeros(3), zeros(3, 1), 0.2)),
+    (
+        "focops_loss",
+        lambda: F.focops_loss(*[zeros(3)] * 3, zeros(3, 1), kl_weight=1.0, max_kl=0.1),
+    ),
+    (
+        "cup_loss",
+        lambda: F.cup_loss(*[zeros(3)] * 3, zeros(3, 1), zeros(2), gamma=0.9, lmbda=0.9),
+    ),
+):
+    bad(f"{name}: shapes", call, ValueError, "advantage", "(3, 1)", "log_prob")
 EYE = torch.eye(2)
 for name, moments in {
     "old_cov": (zeros(2), torch.eye(3), zeros(2), EYE),
@@ -298,6 +337,21 @@ bad(
     "multiplier",
     "(3,)",
     "[m]",
+)
+bad(
+    "exact_penalty: shapes",
+    lambda: exact_penalty(zeros(2), zeros(3), 1.0),
+    ValueError,
+    "objective",
+    "(2,)",
+    "[m]",
+)
+each(
+    "exact_penalty",
+    partial(exact_penalty, zeros(), zeros(2)),
+    "penalty",
+    (0.0, -1.0, NAN, INF),
+    "positive finite number",
 )
 
 # Multipliers.
@@ -944,6 +998,7 @@ each("TrustRegionSafeOptimizer", make_optimizer, "backtrack_ratio", (0.0, 1.0, N
 each("TrustRegionSafeOptimizer", make_optimizer, "max_backtracks", (-1, 0.5), "at least 0")
 each("TrustRegionSafeOptimizer", make_optimizer, "recovery_ratio", (0.0, 1.1, NAN), "in (0, 1]")
 each("TrustRegionSafeOptimizer", make_optimizer, "statistics_kl", (3,), "callable", TypeError)
+each("TrustRegionSafeOptimizer", make_optimizer, "projection", (1,), "True or False", TypeError)
 each("TrustRegionSafeOptimizer", make_optimizer, "cuda_graph", (1,), "True or False", TypeError)
 each("TrustRegionSafeOptimizer", make_optimizer, "cuda_graph", (True,), "on a CUDA device, got cpu")
 bad(
@@ -1611,6 +1666,9 @@ IMPOSSIBLE = {
     "loss.anneal_frames": (-1, "at least 0"),
     "loss.variance_reward": ("none", "'td_error', 'second_moment'"),
     "loss.clip_epsilon": (0.0, "(0, 1)"),
+    "loss.kl_weight": (0.0, "(0, inf)"),
+    "loss.penalty": (0.0, "(0, inf)"),
+    "loss.tolerance": (-0.1, "[0, inf)"),
     "loss.entropy_coeff": (-1.0, "[0, inf)"),
     "lagrangian.policy_lr": (0.0, "(0, inf)"),
     "lagrangian.minibatch_size": (0, "at least 1"),

@@ -36,6 +36,11 @@ OF_METHOD = {
     "ppo_pid": SURROGATE,
     "trpo_lagrangian": SURROGATE,
     "trpo_pid": SURROGATE,
+    "focops": SURROGATE,
+    "cup": SURROGATE,
+    "p3o": SURROGATE,
+    "crpo": SURROGATE,
+    "pcpo": SURROGATE,
     **{
         f"{base}_{how}": SURROGATE
         for base in ("ppo", "trpo")

@@ -163,6 +163,13 @@ class TestFromPython:
         with pytest.raises(ValueError, match=r"SafeTAC needs continuous actions.*OneHot"):
             SafeTAC(cart, run_dir=str(tmp_path / "other"), **EPISODES).train()
 
+    @pytest.mark.parametrize("method", ["focops", "cup", "p3o"])
+    def test_gradient_steps_on_discrete_actions(self, tmp_path, method):
+        run_dir = tmp_path / "run"
+        METHODS[method](cart, run_dir=str(run_dir), **HOW, **EPISODES).train()
+        kl = curves(run_dir)["update/kl"]
+        assert all(0 < each <= 0.1 for each in kl)
+
     def test_network_of_the_user(self, tmp_path):
         asked = []
 
@@ -198,7 +205,9 @@ class TestSeveralCosts:
     jackal = ("env.robot=jackal", "env.task=navigation_speed")
     limits = "loss.cost_limit={collision_cost: 5, speed_cost: 20}"
 
-    @pytest.mark.parametrize("method", ["safetac", "trc", "cpo", "wcsac", "offpolicy_trc"])
+    @pytest.mark.parametrize(
+        "method", ["safetac", "trc", "cpo", "wcsac", "offpolicy_trc", "cup", "p3o", "crpo"]
+    )
     def test_limits(self, tmp_path, method):
         run_dir = tmp_path / "run"
         options = small.options(

@@ -43,8 +43,12 @@ CASES = {
     "trc": ("trc", SURROGATE, {"update/kl", "update/loss_cost_variance"}),
     **{
         name: (name, SURROGATE, {"update/kl", "update/loss_value", "update/multiplier"})
-        for name in ("ppo_lagrangian", "ppo_pid", "trpo_lagrangian", "trpo_pid")
+        for name in ("ppo_lagrangian", "ppo_pid", "trpo_lagrangian", "trpo_pid", "focops")
     },
+    "pcpo": ("pcpo", SURROGATE, {"update/kl", "update/loss_cost_value", "update/cost_level"}),
+    "crpo": ("crpo", SURROGATE, {"update/kl", "update/cost_level", "update/lowers_cost"}),
+    "p3o": ("p3o", SURROGATE, {"update/kl", "update/loss_value", "update/cost_level"}),
+    "cup": ("cup", SURROGATE, {"update/kl", "update/projection_kl", "update/multiplier"}),
     **{
         f"{base}_{how}": (f"{base}_{how}", SURROGATE, {"update/kl", "update/overdrawn"})
         for base in ("ppo", "trpo")
@@ -148,6 +152,16 @@ def test_update_chooses_how_the_policy_moves(tmp_path):
     assert violation > 0
     # kp c + ki (init / ki + c), with the gains of the configuration.
     assert multipliers("pid")[0] == pytest.approx(0.1 + 0.06 * violation, rel=1e-4)
+
+
+@pytest.mark.parametrize(("tolerance", "turn"), [(0.0, 1.0), (1.0, 0.0)])
+def test_crpo_lowers_what_exceeds_its_tolerance(tmp_path, tolerance, turn):
+    """A cost of a step is at most 1, so that it never exceeds a limit of 0 by more than that."""
+    options = ["loss.cost_limit=0", "loss.limit_unit=step", f"loss.tolerance={tolerance}"]
+    launch("crpo", tmp_path / "run", *SURROGATE, *options, "collector.total_frames=800")
+    curves = record.read_metrics(tmp_path / "run" / "log")
+    assert (curves["update/cost_level"][1] > 0).all()
+    assert curves["update/lowers_cost"][1].tolist() == [turn, turn]
 
 
 @pytest.mark.parametrize(("kind", "name"), [("pid", "pid.ki"), ("lagrangian", "lagrangian.init")])

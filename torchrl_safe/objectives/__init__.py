@@ -4,7 +4,12 @@ from __future__ import annotations
 
 from torchrl_safe.objectives.common import MeasuredCVaR
 from torchrl_safe.objectives.cvar import CVaRCostLoss
-from torchrl_safe.objectives.lagrangian import LagrangeMultiplier, PIDMultiplier, lagrangian
+from torchrl_safe.objectives.lagrangian import (
+    LagrangeMultiplier,
+    PIDMultiplier,
+    exact_penalty,
+    lagrangian,
+)
 from torchrl_safe.objectives.limit import LimitController
 from torchrl_safe.objectives.quantile import QuantileCostLoss
 from torchrl_safe.objectives.surrogate import (
@@ -25,5 +30,6 @@ __all__ = [
     "QuantileCostLoss",
     "ReturnSurrogateLoss",
     "TsallisLoss",
+    "exact_penalty",
     "lagrangian",
 ]

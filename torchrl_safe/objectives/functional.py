@@ -17,8 +17,11 @@ from torchrl_safe._checks import check_number, check_shape
 from torchrl_safe._deprecation import moved
 
 __all__ = [
+    "clipped_surrogate",
+    "cup_loss",
     "cvar_factor",
     "discounted_cost_limit",
+    "focops_loss",
     "gaussian_cvar",
     "q_logarithm",
     "surrogate_change",
@@ -250,6 +253,164 @@ def surrogate_change(
     rise, fall = (torch.where(x, log_ratio, 0) for x in (log_ratio > 0, ~(log_ratio > 0)))
     moved = log_weight.exp() * fall.expm1() - (log_weight + rise).exp() * (-rise).expm1()
     return (moved * (advantage - baseline)).sum() / mask.sum().clamp(min=1) / (1 - gamma)
+
+
+def clipped_surrogate(
+    log_prob: Tensor, log_pi: Tensor, advantage: Tensor, clip_epsilon: float
+) -> Tensor:
+    r"""Surrogate of PPO (Schulman et al. 2017, https://arxiv.org/abs/1707.06347, equation 7).
+
+    .. math::
+
+        E\left[\min\left(r A,\ \text{clip}(r, 1 - \epsilon, 1 + \epsilon) A\right)\right], \qquad
+        r = \frac{\pi'(a|s)}{\pi(a|s)}
+
+    A pessimistic bound on the mean of ``r A``: a ratio that has left the interval gains nothing. Of
+    a cost, the bound from above is minus that of ``-A``.
+
+    Args:
+        log_prob (Tensor): log-density of the stored action under ``pi'``, ``[*B]``.
+        log_pi (Tensor): under ``pi``, which took it, ``[*B]``.
+        advantage (Tensor): of ``pi``, ``[*B]``.
+        clip_epsilon (float): in (0, 1).
+
+    Returns:
+        The surrogate, to be maximised, a scalar in the unit of the advantage.
+
+    Raises:
+        ValueError: if shapes disagree or ``clip_epsilon`` is outside (0, 1).
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_safe.objectives.functional import clipped_surrogate
+        >>> log_pi, log_prob = torch.tensor([0.5]).log(), torch.tensor([0.75]).log()
+        >>> clipped_surrogate(log_prob, log_pi, torch.tensor([2.0]), clip_epsilon=0.25)
+        tensor(2.5000)
+        >>> -clipped_surrogate(log_prob, log_pi, -torch.tensor([2.0]), clip_epsilon=0.25)
+        tensor(3.)
+    """
+    for name, tensor in (("log_pi", log_pi), ("advantage", advantage)):
+        check_shape(name, tensor, log_prob.shape, "that of log_prob")
+    if not 0 < clip_epsilon < 1:
+        raise ValueError(f"clip_epsilon must be in (0, 1), got {clip_epsilon}.")
+    ratio = (log_prob - log_pi).exp()
+    clipped = ratio.clamp(1 - clip_epsilon, 1 + clip_epsilon)
+    return torch.minimum(ratio * advantage, clipped * advantage).mean()
+
+
+def focops_loss(
+    log_prob: Tensor,
+    log_pi: Tensor,
+    divergence: Tensor,
+    advantage: Tensor,
+    *,
+    kl_weight: float,
+    max_kl: float,
+) -> Tensor:
+    r"""Loss of FOCOPS (Zhang, Vuong and Ross 2020, https://arxiv.org/abs/2002.06506).
+
+    .. math::
+
+        E\left[\mathbb 1\{\text{KL}_s(\pi' \,\|\, \pi) \le \delta\} \left(
+            \text{KL}_s(\pi' \,\|\, \pi) - \frac{1}{\lambda} \frac{\pi'(a|s)}{\pi(a|s)} A(s, a)
+        \right)\right]
+
+    Where all states are inside the region, its gradient is that of the mean of
+    ``KL(pi' || pi*)``: it projects the policy onto what solves the trust-region problem over all
+    policies, :math:`\pi^*(a|s) \propto \pi(a|s) \exp(A(s, a) / \lambda)`. A state that has left the
+    region adds nothing.
+
+    Args:
+        log_prob (Tensor): log-density of the stored action under ``pi'``, ``[*B]``.
+        log_pi (Tensor): under ``pi``, which took it, ``[*B]``.
+        divergence (Tensor): ``KL(pi' || pi)`` in the state, of the new policy to the old, ``[*B]``
+            in nats.
+        advantage (Tensor): of ``pi``: that of the Lagrangian, ``[*B]``.
+
+    Keyword Args:
+        kl_weight (float): ``lambda > 0``, in the unit of the advantage per nat.
+        max_kl (float): ``delta > 0``, of a state, in nats.
+
+    Returns:
+        The loss, a scalar in nats.
+
+    Raises:
+        ValueError: if shapes disagree, or a number is not positive and finite.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_safe.objectives.functional import focops_loss
+        >>> log_prob, advantage = torch.tensor([0.0, 0.0]), torch.tensor([1.0, 3.0])
+        >>> divergence = torch.tensor([0.0, 0.5])  # the second state has gone too far
+        >>> focops_loss(log_prob, log_prob, divergence, advantage, kl_weight=2.0, max_kl=0.1)
+        tensor(-0.2500)
+    """
+    for name, tensor in (("log_pi", log_pi), ("divergence", divergence), ("advantage", advantage)):
+        check_shape(name, tensor, log_prob.shape, "that of log_prob")
+    check_number("kl_weight", kl_weight, positive=True)
+    check_number("max_kl", max_kl, positive=True)
+    gain = (log_prob - log_pi).exp() * advantage / kl_weight
+    return (divergence - gain).masked_fill(divergence > max_kl, 0).mean()
+
+
+def cup_loss(
+    log_prob: Tensor,
+    log_pi: Tensor,
+    divergence: Tensor,
+    advantage: Tensor,
+    multiplier: Tensor,
+    *,
+    gamma: float,
+    lmbda: float,
+) -> Tensor:
+    r"""Loss of CUP's projection (Yang et al. 2022, https://arxiv.org/abs/2209.07089).
+
+    .. math::
+
+        E\left[\text{KL}_s(\pi_{1/2} \,\|\, \pi') + \frac{1 - \gamma \lambda}{1 - \gamma}
+            \frac{\pi'(a|s)}{\pi(a|s)} \sum_i \nu_i A_{C, i}(s, a)\right]
+
+    ``pi_1/2`` is the policy after a step that followed the return alone. The projection takes back
+    of it what costs more than it is worth at prices ``nu``. The factor is that of the paper's bound
+    on the change of a discounted sum by generalised advantages of trace decay ``lambda``.
+
+    Args:
+        log_prob (Tensor): log-density of the stored action under ``pi'``, ``[*B]``.
+        log_pi (Tensor): under ``pi``, which took it, ``[*B]``.
+        divergence (Tensor): ``KL(pi_1/2 || pi')`` in the state, ``[*B]`` in nats.
+        advantage (Tensor): of the costs, under ``pi``, ``[*B, m]``.
+        multiplier (Tensor): ``nu >= 0``, ``[m]`` in nats per unit of a discounted cost. No gradient
+            flows to it.
+
+    Keyword Args:
+        gamma (float): discount, in [0, 1).
+        lmbda (float): trace decay of the advantages, in [0, 1].
+
+    Returns:
+        The loss, a scalar in nats.
+
+    Raises:
+        ValueError: if shapes disagree, or a coefficient is out of its range.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_safe.objectives.functional import cup_loss
+        >>> log_prob, divergence = torch.zeros(2), torch.tensor([0.0, 0.5])
+        >>> advantage, multiplier = torch.tensor([[1.0], [3.0]]), torch.tensor([0.25])
+        >>> cup_loss(log_prob, log_prob, divergence, advantage, multiplier, gamma=0.75, lmbda=1.0)
+        tensor(0.7500)
+    """
+    shape = log_prob.shape
+    for name, tensor in (("log_pi", log_pi), ("divergence", divergence)):
+        check_shape(name, tensor, shape, "that of log_prob")
+    expected = (*shape, *multiplier.shape[-1:])
+    check_shape("advantage", advantage, expected, "as log_prob and multiplier say")
+    if not 0 <= gamma < 1:
+        raise ValueError(f"gamma must be in [0, 1), got {gamma}.")
+    if not 0 <= lmbda <= 1:
+        raise ValueError(f"lmbda must be in [0, 1], got {lmbda}.")
+    price = (advantage * multiplier.detach()).sum(-1) * (1 - gamma * lmbda) / (1 - gamma)
+    return (divergence + (log_prob - log_pi).exp() * price).mean()
 
 
 def check_entropic_index(entropic_index: float) -> None:

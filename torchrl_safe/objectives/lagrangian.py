@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from torchrl_safe._checks import check_count, check_number, check_shape
 
-__all__ = ["LagrangeMultiplier", "PIDMultiplier", "lagrangian"]
+__all__ = ["LagrangeMultiplier", "PIDMultiplier", "exact_penalty", "lagrangian"]
 
 
 def lagrangian(objective: Tensor, constraint: Tensor, multiplier: Tensor) -> Tensor:
@@ -62,6 +62,43 @@ def lagrangian(objective: Tensor, constraint: Tensor, multiplier: Tensor) -> Ten
             )
         _check_finite(constraint)
     return (objective - (multiplier * constraint).sum(-1)) / (1 + multiplier.sum())
+
+
+def exact_penalty(objective: Tensor, constraint: Tensor, penalty: float) -> Tensor:
+    r"""Objective of a constrained maximisation, less a penalty on what violates it.
+
+    .. math::
+
+        f - \kappa \sum_i \max(0, c_i)
+
+    The penalty is exact: above the largest multiplier of the constrained problem, any ``kappa`` has
+    the same optimum as that problem has, and none has to be learned (P3O, Zhang et al. 2022,
+    https://arxiv.org/abs/2205.11814).
+
+    Args:
+        objective (Tensor): ``f``, to be maximised, a scalar.
+        constraint (Tensor): ``c``, feasible at or below 0, ``[m]``.
+        penalty (float): ``kappa > 0``, in the unit of the objective per unit of a constraint.
+
+    Returns:
+        The penalised objective, to be maximised, a scalar.
+
+    Raises:
+        ValueError: if shapes disagree, or ``penalty`` is not positive and finite.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_safe.objectives import exact_penalty
+        >>> exact_penalty(torch.tensor(4.0), torch.tensor([-1.0, 0.5]), penalty=3.0)
+        tensor(2.5000)
+    """
+    if objective.ndim or constraint.ndim != 1:
+        raise ValueError(
+            "objective and constraint must have shapes [] and [m], got "
+            f"{tuple(objective.shape)} and {tuple(constraint.shape)}."
+        )
+    check_number("penalty", penalty, positive=True)
+    return objective - penalty * constraint.relu().sum()
 
 
 class LagrangeMultiplier(nn.Module):

@@ -5,13 +5,15 @@ of constraints::
 
     maximise g'x   subject to   c + B x <= 0   and   x'H x / 2 <= max_kl
 
-The solution lies in the span of ``H^-1 g`` and ``H^-1 b_i``, so it only needs their Gram matrix.
+or that of PCPO (arXiv 2010.03152), which follows the objective first and is then projected. Either
+solution lies in the span of ``H^-1 g`` and ``H^-1 b_i``, so it only needs their Gram matrix.
 Everything here is double precision and has no more than ``1 + m`` dimensions.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -98,6 +100,73 @@ def solve_subproblem(
         >>> solve_subproblem(1.0, [0.0], [[1.0]], [3.0], max_kl=0.5).case
         'infeasible'
     """
+    problem = _in_radii(q, r, s, c, max_kl)
+    if isinstance(problem, Subproblem):
+        return problem
+    sets, distance, flat = problem.sets, problem.distance, problem.flat
+    case = "feasible"
+    if flat or (distance > _FEASIBILITY).any():
+        target, repaired = _recover(sets, distance, recovery_ratio)
+        if not (target[distance > 0] > _FEASIBILITY).any():
+            return problem.rejected("no step lowers a violated constraint")
+        case = "recoverable" if repaired and not flat else "infeasible"
+        distance = target
+    return problem.solution(case, *sets.best(distance, problem.unit, problem.cosine))
+
+
+def project_step(q: float, r: ArrayLike, s: ArrayLike, c: ArrayLike, max_kl: float) -> Subproblem:
+    r"""The step of PCPO (Yang et al. 2020, https://arxiv.org/abs/2010.03152), for m constraints.
+
+    It is that of TRPO, ``x_r = sqrt(2 max_kl / q) H^-1 g``, moved to the nearest point, in the
+    metric of ``H``, where the linearised constraints hold::
+
+        minimise (x - x_r)'H (x - x_r) / 2   subject to   c + B x <= 0
+
+    For one constraint, ``x = x_r - max(0, (b'x_r + c) / s) H^-1 b``. A point outside the trust
+    region is drawn back to its boundary, on the straight line to where the step starts: there a
+    violated constraint is still nearer to its limit, and a satisfied one satisfied.
+
+    Args:
+        q (float): ``g' H^-1 g``.
+        r (array): ``b_i' H^-1 g``, shape [m].
+        s (array): ``b_i' H^-1 b_j``, shape [m, m].
+        c (array): value of the constraints, shape [m], in their own units; satisfied at ``<= 0``.
+        max_kl (float): size of the region, in nats.
+
+    Returns:
+        Subproblem: the weights of the step, and the case. There is no step where no point satisfies
+        all constraints.
+
+    Raises:
+        ValueError: for more than 10 constraints, or shapes that do not fit each other.
+
+    Examples:
+        >>> solution = project_step(1.0, [0.5], [[1.0]], [0.25], max_kl=0.5)
+        >>> solution.case, float(solution.objective_weight), solution.constraint_weight.tolist()
+        ('recoverable', 1.0, [0.75])
+    """
+    problem = _in_radii(q, r, s, c, max_kl, reach=np.inf)
+    if isinstance(problem, Subproblem):
+        return problem
+    weight = None if problem.flat else problem.sets.nearest(problem.distance + problem.cosine)
+    if weight is None:
+        return problem.rejected("no step satisfies all constraints")
+    square = problem.unit - 2 * weight @ problem.cosine + weight @ problem.sets.gram @ weight
+    length = max(1.0, float(np.sqrt(square)))
+    if (problem.distance > _FEASIBILITY).any():
+        case = "recoverable" if length <= 1 + _FEASIBILITY else "infeasible"
+    else:
+        case = "feasible" if (problem.distance >= -1).any() else "inert"
+    return problem.solution(case, problem.unit / length, weight / length)
+
+
+def _in_radii(
+    q: float, r: ArrayLike, s: ArrayLike, c: ArrayLike, max_kl: float, reach: float = 1.0
+) -> _InRadii | Subproblem:
+    """The problem in units of the region's radius; or what is known without solving it.
+
+    A constraint is left out that no step of length ``reach`` can violate.
+    """
     r, s, c = (np.asarray(value, dtype=np.float64) for value in (r, s, c))
     m = c.size
     if r.shape != (m,) or s.shape != (m, m) or c.shape != (m,):
@@ -118,25 +187,46 @@ def solve_subproblem(
     length = np.sqrt(2 * max_kl)
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         distance = c / (length * np.sqrt(variance))
-    # A satisfied constraint whose boundary lies outside the region cannot become active.
-    kept = np.flatnonzero((variance > 0) & (distance >= -1))
+    kept = np.flatnonzero((variance > 0) & (distance >= -reach))
     objective_scale = length / unit[0] if q > 0 else 0.0
     flat = bool(((variance == 0) & (c > 0)).any())
     if not (kept.size or flat):
         return Subproblem("inert" if m else "unconstrained", objective_scale, weight)
-    sets = _ActiveSets(gram[1:, 1:][np.ix_(kept, kept)])
-    distance = distance[kept]
-    case = "feasible"
-    if flat or (distance > _FEASIBILITY).any():
-        target, repaired = _recover(sets, distance, recovery_ratio)
-        if not (target[distance > 0] > _FEASIBILITY).any():
-            return Subproblem("rejected", 0.0, weight, "no step lowers a violated constraint")
-        case = "recoverable" if repaired and not flat else "infeasible"
-        distance = target
-    along_objective, along_constraint = sets.best(distance, gram[0, 0], gram[0, 1:][kept])
-    scale = unit[1:][kept]
-    weight[kept] = along_constraint * length / scale
-    return Subproblem(case, along_objective * objective_scale, weight)
+    return _InRadii(
+        sets=_ActiveSets(gram[1:, 1:][np.ix_(kept, kept)]),
+        distance=distance[kept],
+        unit=float(gram[0, 0]),
+        cosine=gram[0, 1:][kept],
+        flat=flat,
+        kept=kept,
+        num_constraints=m,
+        objective_scale=objective_scale,
+        constraint_scale=length / unit[1:][kept],
+    )
+
+
+class _InRadii(NamedTuple):
+    """A subproblem in units of the region's radius, of the constraints within reach."""
+
+    sets: _ActiveSets
+    distance: Array  # d_i, [kept]
+    unit: float  # squared length of v_0: one, or zero when there is no objective
+    cosine: Array  # v_i'v_0, [kept]
+    flat: bool  # whether a violated constraint has no gradient
+    kept: NDArray[np.intp]
+    num_constraints: int
+    objective_scale: float
+    constraint_scale: Array  # [kept]
+
+    def solution(self, case: str, along_objective: float, along_constraint: Array) -> Subproblem:
+        """The step ``a v_0 - sum_i w_i v_i`` in the problem's own units."""
+        weight = np.zeros(self.num_constraints)
+        weight[self.kept] = along_constraint * self.constraint_scale
+        return Subproblem(case, along_objective * self.objective_scale, weight)
+
+    def rejected(self, reason: str) -> Subproblem:
+        """No step."""
+        return Subproblem("rejected", 0.0, np.zeros(self.num_constraints), reason)
 
 
 class _ActiveSets:
@@ -181,6 +271,15 @@ class _ActiveSets:
         """Whether some point within ``radius`` of the origin satisfies all constraints."""
         weight, _, near = self._nearest(distance, radius)
         return bool((near & self._feasible(-weight @ self.gram, distance)).any())
+
+    def nearest(self, distance: Array) -> Array | None:
+        """Weights of the polyhedron's point nearest to the origin, [m]; none if it is empty."""
+        weight, norm, near = self._nearest(distance, np.inf)
+        tolerance = _FEASIBILITY * (1 + np.abs(distance))
+        valid = near & (distance - weight @ self.gram <= tolerance).all(-1)
+        if not valid.any():
+            return None
+        return np.asarray(weight[np.where(valid, norm, np.inf).argmin()])
 
     def best(
         self, distance: Array, unit: float, cosine: Array, radius: float = 1.0

@@ -31,7 +31,7 @@ from torchrl_safe.optim.curvature import (
     unflatten,
 )
 from torchrl_safe.optim.repetition import CudaGraphRepeat, one_by_one
-from torchrl_safe.optim.subproblem import MAX_CONSTRAINTS, solve_subproblem
+from torchrl_safe.optim.subproblem import MAX_CONSTRAINTS, project_step, solve_subproblem
 
 __all__ = ["TrustRegionReport", "TrustRegionSafeOptimizer"]
 
@@ -164,7 +164,8 @@ class TrustRegionSafeOptimizer(torch.optim.Optimizer):
     first, see :func:`~torchrl_safe.optim.subproblem.solve_subproblem`.
 
     Without constraints this is TRPO (https://arxiv.org/abs/1502.05477), with them CPO
-    (https://arxiv.org/abs/1705.10528): the closure decides.
+    (https://arxiv.org/abs/1705.10528): the closure decides. With ``projection`` it is PCPO
+    (https://arxiv.org/abs/2010.03152), see :func:`~torchrl_safe.optim.subproblem.project_step`.
 
     **The closure** is a deterministic function of the current parameters (draw noise once, before
     the step) that returns a TensorDict without batch size, holding
@@ -193,7 +194,9 @@ class TrustRegionSafeOptimizer(torch.optim.Optimizer):
         max_backtracks (int): how often it is applied at most. Defaults to 10.
         recovery_ratio (float): share of the region's radius that a violated constraint may claim,
             in (0, 1]; the rest goes to the objective. At 1 a violation that cannot be removed at
-            once gives CPO's pure recovery step. Defaults to 1.0.
+            once gives CPO's pure recovery step; a projection has no use for it. Defaults to 1.0.
+        projection (bool): whether the step is that up the objective alone, then projected onto the
+            constraints, in place of the subproblem's. Defaults to ``False``.
         statistics_kl (callable, optional): from old and new statistics to their mean KL, a scalar,
             twice differentiable in the new ones.
         cuda_graph (bool): whether conjugate gradients run as a CUDA graph, on a stream of their
@@ -207,7 +210,8 @@ class TrustRegionSafeOptimizer(torch.optim.Optimizer):
     ``torch.optim.lr_scheduler`` set. Inside ``torch.compile`` a step runs as it does outside.
 
     Raises:
-        TypeError: if ``statistics_kl`` is not callable, or ``cuda_graph`` not a bool.
+        TypeError: if ``statistics_kl`` is not callable, or ``projection`` or ``cuda_graph`` not a
+            bool.
         ValueError: if an argument is out of its range, or the parameters are not floating point,
             differ in dtype or device, come in several groups, one of them twice, or are not on a
             CUDA device with ``cuda_graph``.
@@ -242,14 +246,17 @@ class TrustRegionSafeOptimizer(torch.optim.Optimizer):
         backtrack_ratio: float = 0.8,
         max_backtracks: int = 10,
         recovery_ratio: float = 1.0,
+        projection: bool = False,
         statistics_kl: StatisticsKL | None = None,
         cuda_graph: bool = False,
     ) -> None:
         if statistics_kl is not None and not callable(statistics_kl):
             raise TypeError(f"statistics_kl must be callable or None, got {statistics_kl!r}.")
-        if not isinstance(cuda_graph, bool):
-            raise TypeError(f"cuda_graph must be True or False, got {cuda_graph!r}.")
+        for name, value in (("projection", projection), ("cuda_graph", cuda_graph)):
+            if not isinstance(value, bool):
+                raise TypeError(f"{name} must be True or False, got {value!r}.")
         self.statistics_kl = statistics_kl
+        self.projection = projection
         self.cuda_graph = cuda_graph
         defaults = {
             "lr": 1.0,
@@ -269,8 +276,8 @@ class TrustRegionSafeOptimizer(torch.optim.Optimizer):
             group.setdefault("lr", 1.0)
 
     def __getstate__(self) -> dict[str, Any]:
-        kept = {"statistics_kl": self.statistics_kl, "cuda_graph": self.cuda_graph}
-        return super().__getstate__() | kept
+        names = ("statistics_kl", "projection", "cuda_graph")
+        return super().__getstate__() | {name: getattr(self, name) for name in names}
 
     @cached_property
     def _graphs(self) -> CudaGraphRepeat:
@@ -447,13 +454,12 @@ class TrustRegionSafeOptimizer(torch.optim.Optimizer):
             iterations=settings["cg_iters"],
             repeat=self._graphs if self.cuda_graph else one_by_one,
         )
-        solution = solve_subproblem(
-            natural.gram[0, 0],
-            natural.gram[1:, 0],
-            natural.gram[1:, 1:],
-            before.constraint,
-            max_kl,
-            settings["recovery_ratio"],
+        gram = natural.gram
+        products = (gram[0, 0], gram[1:, 0], gram[1:, 1:], before.constraint, max_kl)
+        solution = (
+            project_step(*products)
+            if self.projection
+            else solve_subproblem(*products, settings["recovery_ratio"])
         )
         if solution.reason:
             raise NoStep(solution.reason)
@@ -463,8 +469,8 @@ class TrustRegionSafeOptimizer(torch.optim.Optimizer):
         return _Proposal(
             case=solution.case,
             direction=natural.combine(dual),
-            predicted=(natural.gram @ dual).tolist(),
-            reach=np.sqrt(2 * max_kl * np.diag(natural.gram).clip(0)),
+            predicted=(gram @ dual).tolist(),
+            reach=np.sqrt(2 * max_kl * np.diag(gram).clip(0)),
             cg_residual=natural.cg_residual,
         )
 

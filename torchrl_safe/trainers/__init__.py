@@ -12,8 +12,13 @@ from torchrl_safe.trainers.budgets import (
     TRPOEarlyTerminated,
     TRPOSaute,
 )
+from torchrl_safe.trainers.crpo import CRPO
+from torchrl_safe.trainers.cup import CUP
+from torchrl_safe.trainers.focops import FOCOPS
 from torchrl_safe.trainers.methods import METHODS
 from torchrl_safe.trainers.offpolicy_trc import OffPolicyTRC
+from torchrl_safe.trainers.p3o import P3O
+from torchrl_safe.trainers.pcpo import PCPO
 from torchrl_safe.trainers.ppo_lagrangian import PPOPID, PPOLagrangian
 from torchrl_safe.trainers.safetac import SafeTAC
 from torchrl_safe.trainers.saved_policies import load_policy
@@ -26,7 +31,12 @@ from torchrl_safe.trainers.wcsac import SACPID, WCSAC, SACLagrangian
 
 __all__ = [
     "CPO",
+    "CRPO",
+    "CUP",
+    "FOCOPS",
     "METHODS",
+    "P3O",
+    "PCPO",
     "PPOPID",
     "SACPID",
     "TAC",

@@ -11,17 +11,17 @@ from typing import Any, ClassVar, Literal
 
 from pydantic import Field
 from tensordict import TensorDict, TensorDictBase
-from torchrl.envs import EnvBase
-from torchrl.objectives import ClipPPOLoss
 
 from torchrl_safe.envs import EarlyTermination, SafetyBudget, Saute
 from torchrl_safe.trainers.on_policy import (
+    ClippedLoss,
+    ClippedTrainer,
     GradientOptim,
-    GradientTrainer,
     KLOptim,
     OnPolicyCollector,
     SurrogateLoss,
     TrustRegionTrainer,
+    unit_of,
 )
 from torchrl_safe.trainers.options import (
     ConstrainedLoss,
@@ -33,7 +33,6 @@ from torchrl_safe.trainers.options import (
     option,
     per_episode,
 )
-from torchrl_safe.trainers.ppo_lagrangian import ClippedLoss
 from torchrl_safe.trainers.trainer import ConstrainedTrainer
 
 
@@ -167,23 +166,15 @@ class BudgetTrainer(ConstrainedTrainer):
         }
 
 
-class BudgetPPO(BudgetTrainer, GradientTrainer):
+class BudgetPPO(BudgetTrainer, ClippedTrainer):
     """PPO in an environment with a budget."""
-
-    def build(self, env: EnvBase) -> dict[str, Any]:
-        """A policy with PPO's loss, and a critic of states."""
-        components = super().build(env)
-        self.policy_loss = ClipPPOLoss(
-            self.policy,
-            clip_epsilon=self.options.loss.clip_epsilon,
-            entropy_bonus=False,
-            normalize_advantage=True,
-        )
-        return components
 
     def policy_step(self, data: TensorDictBase, batch: TensorDictBase) -> dict[str, float]:
         """Passes up the return."""
-        return {**self.descend(data, self.policy_loss), **self.budgeted(batch)}
+        advantage = data["advantage"].squeeze(-1)
+        advantage = (advantage - advantage.mean()) / unit_of(advantage)
+        moved = self.descend(data.copy().set("advantage", advantage), self.losses_of)
+        return {**moved, **self.budgeted(batch)}
 
 
 class BudgetTRPO(BudgetTrainer, TrustRegionTrainer):

@@ -8,7 +8,12 @@ from torchrl_safe.trainers.budgets import (
     TRPOEarlyTerminated,
     TRPOSaute,
 )
+from torchrl_safe.trainers.crpo import CRPO
+from torchrl_safe.trainers.cup import CUP
+from torchrl_safe.trainers.focops import FOCOPS
 from torchrl_safe.trainers.offpolicy_trc import OffPolicyTRC
+from torchrl_safe.trainers.p3o import P3O
+from torchrl_safe.trainers.pcpo import PCPO
 from torchrl_safe.trainers.ppo_lagrangian import PPOPID, PPOLagrangian
 from torchrl_safe.trainers.safetac import SafeTAC
 from torchrl_safe.trainers.tac import TAC
@@ -24,6 +29,7 @@ METHODS: dict[str, type[Trainer]] = {
         *(SafeTAC, TAC, WCSAC, SACLagrangian, SACPID, TD3Lagrangian),
         *(TRC, CPO, OffPolicyTRC),
         *(PPOLagrangian, PPOPID, TRPOLagrangian, TRPOPID),
+        *(FOCOPS, CUP, P3O, CRPO, PCPO),
         *(PPOSaute, TRPOSaute, PPOEarlyTerminated, TRPOEarlyTerminated),
     )
 }

@@ -17,7 +17,13 @@ from torchrl._utils import timeit
 from torchrl.envs import EnvBase
 
 from torchrl_safe.modules import DISTANCES
-from torchrl_safe.objectives import CostMoments, CVaRSurrogateLoss, ReturnSurrogateLoss
+from torchrl_safe.objectives import (
+    CostMoments,
+    CVaRSurrogateLoss,
+    ReturnSurrogateLoss,
+    lagrangian,
+)
+from torchrl_safe.objectives.functional import clipped_surrogate
 from torchrl_safe.optim import FiniteSteps
 from torchrl_safe.trainers.networks import is_discrete
 from torchrl_safe.trainers.off_policy import as_components, minibatches
@@ -31,7 +37,7 @@ from torchrl_safe.trainers.options import (
     again,
     option,
 )
-from torchrl_safe.trainers.policy_steps import make_trust_region
+from torchrl_safe.trainers.policy_steps import make_multiplier, make_trust_region
 from torchrl_safe.trainers.trainer import ConstrainedTrainer
 
 
@@ -77,13 +83,13 @@ class SurrogateCritics(Group):
 
 
 class KLOptim(KLRegion, SurrogateCritics):
-    """Critics and a trust-region step without constraints."""
+    """Critics and a trust-region step."""
 
     damping: float = again(KLRegion, "damping", 0.1)
 
 
 class SurrogateOptim(TrustRegion, KLOptim):
-    """Critics and the trust-region step."""
+    """Critics and a trust-region step under constraints."""
 
     recovery_ratio: float = again(TrustRegion, "recovery_ratio", 1.0)
 
@@ -128,6 +134,24 @@ class GradientOptions(OnPolicyOptions):
     """The options of on-policy methods of gradient steps."""
 
     optim: GradientOptim = Field(default_factory=GradientOptim)
+
+
+class ClippedLoss(MeanSurrogateLoss):
+    """Reward, the limit, and how far a ratio may go."""
+
+    clip_epsilon: float = option(0.2, "ratios beyond 1 +- this gain nothing", gt=0, lt=1)
+
+
+class ClippedOptions(GradientOptions):
+    """The options of on-policy methods with clipped ratios."""
+
+    loss: ClippedLoss = Field(default_factory=ClippedLoss)
+
+
+class KLOptions(OnPolicyOptions):
+    """The options of on-policy methods whose trust-region step makes no room for recovery."""
+
+    optim: KLOptim = Field(default_factory=KLOptim)
 
 
 class SurrogateTrainer(ConstrainedTrainer):
@@ -248,12 +272,17 @@ class TrustRegionTrainer(SurrogateTrainer):
     """A trust region on surrogates of return and costs."""
 
     Options: ClassVar[type[MethodOptions]] = SurrogateOptions
+    projection: ClassVar[bool] = False  # whether a step follows the return and is then projected
 
     def build(self, env: EnvBase) -> dict[str, Any]:
         """A policy, surrogates with critics of states, and the trust region."""
         components = super().build(env)
         self.trust_region = make_trust_region(
-            self.options.optim, self.policy, self.distance, self.options.device
+            self.options.optim,
+            self.policy,
+            self.distance,
+            self.options.device,
+            projection=self.projection,
         )
         return {**components, "policy_optim": self.trust_region}
 
@@ -357,3 +386,44 @@ class GradientTrainer(SurrogateTrainer):
             "update/epochs": float(epochs),
             "update/skipped_steps": float(self.policy_steps.count()),
         }
+
+
+class ClippedTrainer(GradientTrainer):
+    """Gradient steps on PPO's surrogate."""
+
+    def losses_of(self, minibatch: TensorDictBase) -> dict[str, Tensor]:
+        """Down minus the clipped surrogate of steps whose ``"advantage"`` is standardised, flat."""
+        log_prob = self.policy.get_dist(minibatch).log_prob(minibatch["action"])
+        old, advantage = minibatch["policy_log_prob"], minibatch["advantage"]
+        surrogate = clipped_surrogate(log_prob, old, advantage, self.options.loss.clip_epsilon)
+        return {"loss_policy": -surrogate}
+
+
+class PricedTrainer(GradientTrainer):
+    """Gradient steps on the advantage of the Lagrangian, whose multipliers follow the costs."""
+
+    def build(self, env: EnvBase) -> dict[str, Any]:
+        """A policy, surrogates with critics of states, the policy's optimizer, a multiplier."""
+        self.multiplier = make_multiplier(self)
+        return {**super().build(env), "multiplier": self.multiplier}
+
+    def policy_step(self, data: TensorDictBase, batch: TensorDictBase) -> dict[str, float]:
+        """The multiplier's step, then passes up the Lagrangian."""
+        measured = self.measure(batch)
+        priced = self.multiplier.react(self, self.measured_levels(measured))
+        advantage = lagrangian(*self.advantages(data, measured), self.multiplier())
+        advantage = advantage / unit_of(advantage)
+        moved = self.descend(data.copy().set("advantage", advantage), self.losses_of)
+        return {**moved, **priced, **self.deviations(measured)}
+
+    def losses_of(self, minibatch: TensorDictBase) -> dict[str, Tensor]:
+        """The policy's losses ``loss_*`` on steps whose advantage is that of the Lagrangian.
+
+        ``"advantage"`` is standardised, and has the shape of the steps.
+        """
+        raise NotImplementedError
+
+
+def unit_of(advantage: Tensor) -> Tensor:
+    """The unit that gradient steps expect advantages in: their standard deviation, a scalar."""
+    return advantage.std(correction=0).clamp(min=1e-6)

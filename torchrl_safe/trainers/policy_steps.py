@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 import torch
+from pydantic import Field
 from tensordict import TensorDict
 from torch import Tensor, nn
 
@@ -40,8 +41,26 @@ class PID(Group):
     kd: float = option(0.05, "derivative gain", ge=0)
 
 
+class Priced(Group):
+    """What the options of methods have whose multiplier learns from every batch."""
+
+    lagrangian: QuickLagrangian = Field(default_factory=QuickLagrangian)
+
+
+class Controlled(Group):
+    """What the options of methods have whose multiplier a controller sets."""
+
+    lagrangian: InitialPrice = Field(default_factory=InitialPrice)
+    pid: PID = Field(default_factory=PID)
+
+
 def make_trust_region(
-    options: KLRegion, policy: nn.Module, distance: Distance, device: str
+    options: KLRegion,
+    policy: nn.Module,
+    distance: Distance,
+    device: str,
+    *,
+    projection: bool = False,
 ) -> TrustRegionSafeOptimizer:
     """The optimizer of the policy, with the options' numbers."""
     return TrustRegionSafeOptimizer(
@@ -52,6 +71,7 @@ def make_trust_region(
         backtrack_ratio=options.backtrack_ratio,
         max_backtracks=options.max_backtracks,
         recovery_ratio=options.recovery_ratio if isinstance(options, TrustRegion) else 1.0,
+        projection=projection,
         statistics_kl=distance.kl,
         cuda_graph=options.cuda_graphs and torch.device(device).type == "cuda",
     )

@@ -2,40 +2,20 @@
 
 from __future__ import annotations
 
-from typing import Any, ClassVar
+from typing import ClassVar
 
-from pydantic import Field
-from tensordict import TensorDictBase
-from torchrl.envs import EnvBase
-from torchrl.objectives import ClipPPOLoss
-
-from torchrl_safe.objectives import lagrangian
-from torchrl_safe.trainers.on_policy import GradientOptions, GradientTrainer, MeanSurrogateLoss
-from torchrl_safe.trainers.options import InitialPrice, MethodOptions, option
-from torchrl_safe.trainers.policy_steps import PID, QuickLagrangian, make_multiplier
+from torchrl_safe.trainers.on_policy import ClippedOptions, ClippedTrainer, PricedTrainer
+from torchrl_safe.trainers.options import MethodOptions
+from torchrl_safe.trainers.policy_steps import Controlled, Priced
 
 
-class ClippedLoss(MeanSurrogateLoss):
-    """Reward, the limit, and how far a ratio may go."""
-
-    clip_epsilon: float = option(0.2, "ratios beyond 1 +- this gain nothing", gt=0, lt=1)
-
-
-class ClippedOptions(GradientOptions):
-    """What the options of methods with clipped ratios have."""
-
-    loss: ClippedLoss = Field(default_factory=ClippedLoss)
-
-
-class PPOLagrangianOptions(ClippedOptions):
+class PPOLagrangianOptions(Priced, ClippedOptions):
     """The options of PPO-Lagrangian."""
 
     method: ClassVar[str] = "ppo_lagrangian"
 
-    lagrangian: QuickLagrangian = Field(default_factory=QuickLagrangian)
 
-
-class PPOLagrangian(GradientTrainer):
+class PPOLagrangian(ClippedTrainer, PricedTrainer):
     """Proximal policy optimization of the Lagrangian: clipped ratios on its advantage.
 
     Examples:
@@ -46,34 +26,11 @@ class PPOLagrangian(GradientTrainer):
 
     Options: ClassVar[type[MethodOptions]] = PPOLagrangianOptions
 
-    def build(self, env: EnvBase) -> dict[str, Any]:
-        """A policy with PPO's loss, surrogates with critics of states, and a multiplier."""
-        components = super().build(env)
-        self.policy_loss = ClipPPOLoss(
-            self.policy,
-            clip_epsilon=self.options.loss.clip_epsilon,
-            entropy_bonus=False,
-            normalize_advantage=True,
-        )
-        self.multiplier = make_multiplier(self)
-        return {**components, "multiplier": self.multiplier}
 
-    def policy_step(self, data: TensorDictBase, batch: TensorDictBase) -> dict[str, float]:
-        """The multiplier's step, then passes up the Lagrangian."""
-        measured = self.measure(batch)
-        priced = self.multiplier.react(self, self.measured_levels(measured))
-        advantage = lagrangian(*self.advantages(data, measured), self.multiplier())
-        data = data.copy().set("advantage", advantage.unsqueeze(-1))
-        return {**self.descend(data, self.policy_loss), **priced, **self.deviations(measured)}
-
-
-class PPOPIDOptions(ClippedOptions):
+class PPOPIDOptions(Controlled, ClippedOptions):
     """The options of PPO-PID."""
 
     method: ClassVar[str] = "ppo_pid"
-
-    lagrangian: InitialPrice = Field(default_factory=InitialPrice)
-    pid: PID = Field(default_factory=PID)
 
 
 class PPOPID(PPOLagrangian):

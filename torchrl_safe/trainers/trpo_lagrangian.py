@@ -4,28 +4,19 @@ from __future__ import annotations
 
 from typing import Any, ClassVar
 
-from pydantic import Field
 from tensordict import TensorDict, TensorDictBase
 from torchrl.envs import EnvBase
 
 from torchrl_safe.objectives import lagrangian
-from torchrl_safe.trainers.on_policy import KLOptim, OnPolicyOptions, TrustRegionTrainer
-from torchrl_safe.trainers.options import InitialPrice, MethodOptions
-from torchrl_safe.trainers.policy_steps import PID, QuickLagrangian, make_multiplier
+from torchrl_safe.trainers.on_policy import KLOptions, TrustRegionTrainer
+from torchrl_safe.trainers.options import MethodOptions
+from torchrl_safe.trainers.policy_steps import Controlled, Priced, make_multiplier
 
 
-class KLOptions(OnPolicyOptions):
-    """What the options of methods with a trust region without constraints have."""
-
-    optim: KLOptim = Field(default_factory=KLOptim)
-
-
-class TRPOLagrangianOptions(KLOptions):
+class TRPOLagrangianOptions(Priced, KLOptions):
     """The options of TRPO-Lagrangian."""
 
     method: ClassVar[str] = "trpo_lagrangian"
-
-    lagrangian: QuickLagrangian = Field(default_factory=QuickLagrangian)
 
 
 class TRPOLagrangian(TrustRegionTrainer):
@@ -59,13 +50,10 @@ class TRPOLagrangian(TrustRegionTrainer):
         return {**report.to_dict(), **priced, **self.deviations(measured)}
 
 
-class TRPOPIDOptions(KLOptions):
+class TRPOPIDOptions(Controlled, KLOptions):
     """The options of TRPO-PID."""
 
     method: ClassVar[str] = "trpo_pid"
-
-    lagrangian: InitialPrice = Field(default_factory=InitialPrice)
-    pid: PID = Field(default_factory=PID)
 
 
 class TRPOPID(TRPOLagrangian):

@@ -20,14 +20,13 @@ from torchrl_safe.trainers.off_policy import (
 )
 from torchrl_safe.trainers.options import (
     ConstrainedLoss,
-    InitialPrice,
     Lagrangian,
     MethodOptions,
     ReplayBuffer,
     again,
     option,
 )
-from torchrl_safe.trainers.policy_steps import PID
+from torchrl_safe.trainers.policy_steps import Controlled
 
 
 class WCSACLoss(ConstrainedLoss):
@@ -111,14 +110,12 @@ class SACLagrangian(WCSAC):
     Options: ClassVar[type[MethodOptions]] = SACLagrangianOptions
 
 
-class SACPIDOptions(SoftOptions):
+class SACPIDOptions(Controlled, SoftOptions):
     """The options of SAC-PID."""
 
     method: ClassVar[str] = "sac_pid"
 
     loss: SACLagrangianLoss = Field(default_factory=SACLagrangianLoss)
-    lagrangian: InitialPrice = Field(default_factory=InitialPrice)
-    pid: PID = Field(default_factory=PID)
 
 
 class SACPID(SACLagrangian):

@@ -16,6 +16,7 @@ _AT_ONCE = 512  # attempts that are made at once, or one for each environment
 _FIRST, _SECOND = 6, 24  # candidates looked at first and then: mostly one of them will do
 _BLOCK = 32_768  # candidates compared at once: they stay in the processor's cache
 _FEW = 5  # discs that a candidate is compared with first: mostly it is too near to one of them
+_SMALL = 8192  # comparisons that are not worth such care
 _GOAL_CANDIDATES = 256  # positions tried for one that moves during an episode
 
 
@@ -56,10 +57,12 @@ def scatter(
         attempt = np.tile(np.arange(at_once), len(pending))
         placed, legal = _attempt(keepout, half, streams, rows[owner], attempt * numbers, candidates)
         # The first legal attempt counts, as if each had waited for the one before it.
-        found, first = np.unique(owner[legal], return_index=True)
-        layout[found] = placed[:, :, legal[first]].T
-        streams.skip(rows[found], (attempt[legal[first]] + 1) * numbers)
-        pending = np.setdiff1d(pending, found, assume_unique=True)
+        whose = owner[legal]
+        first = legal[np.append(True, whose[1:] != whose[:-1])[: len(whose)]]
+        found = owner[first]
+        layout[found] = placed[:, :, first].T
+        streams.skip(rows[found], (attempt[first] + 1) * numbers)
+        pending = _without(pending, found, len(rows))
         if not pending.size:
             return layout
         streams.skip(rows[pending], at_once * numbers)
@@ -93,13 +96,11 @@ def _attempt(
 
     def settle(j: int, places: Array, some: NDArray[np.integer]) -> NDArray[np.integer]:
         """Puts an object on the first legal one of the places [2, c, n]; who has none is left."""
-        # Those that keep most away come first: they leave few candidates to the others.
-        others = np.argsort(-keepout[:j], kind="stable")
-        gaps = (keepout[j] + keepout[others]) ** 2
-        free = _clear(places, placed.take(some, -1).take(others, 1), gaps)
+        others = placed[:, :j] if len(some) == len(rows) else placed[:, :j].take(some, -1)
+        free = _clear(places, others, keepout[j] + keepout[:j])
         first, each = free.argmax(0), np.arange(len(some))
         found = free[first, each]
-        placed[:, j, some[found]] = places[:, first[found], each[found]]
+        placed[:, j, some] = places[:, first, each]
         return some[~found]
 
     legal = np.arange(len(rows))
@@ -113,18 +114,30 @@ def _attempt(
             parts = np.split(nowhere, ends)
             left = [settle(j, draw(objects[[j]], start, end, part)[:, 0], part) for part in parts]
             nowhere = np.concatenate(left)
-        legal = np.setdiff1d(legal, nowhere, assume_unique=True)
+        legal = _without(legal, nowhere, len(rows))
     return placed, legal
 
 
-def _clear(places: Array, others: Array, gaps: Array) -> NDArray[np.bool_]:
-    """Which of the places [2, c, n] are far enough from all others [2, K, n].
+def _without(
+    some: NDArray[np.integer], others: NDArray[np.integer], count: int
+) -> NDArray[np.intp]:
+    """Those of some numbers below ``count`` that are not among others."""
+    left = np.zeros(count, bool)
+    left[some] = True
+    left[others] = False
+    return np.flatnonzero(left)
 
-    ``gaps`` [K] are the squares of the smallest distances.
-    """
-    few, rest = slice(_FEW), slice(_FEW, None)
+
+def _clear(places: Array, others: Array, gaps: Array) -> NDArray[np.bool_]:
+    """Which of the places [2, c, n] are as far as ``gaps`` [K] from the others [2, K, n]."""
+    gaps = gaps**2
+    if len(gaps) * places.size < _SMALL:
+        return _apart(places, others[:, :, None], gaps[:, None, None])
+    # Those that keep most away come first: they leave few candidates to the others.
+    order = np.argsort(-gaps, kind="stable")
+    few, rest = order[:_FEW], order[_FEW:]
     free = _apart(places, others[:, few, None], gaps[few, None, None])
-    if len(gaps) > _FEW:
+    if rest.size:
         where = np.flatnonzero(free)
         left = places.reshape(2, -1).take(where, -1)
         others = others[:, rest].take(where % free.shape[1], -1)

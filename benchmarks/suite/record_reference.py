@@ -6,7 +6,8 @@ It runs in a Python of its own (see the README of this folder), not in that of t
 
 Per task there are a few short episodes. In each the robot is put in front of another kind of object
 and driven at it, so that costs, contacts and reached goals are among the steps. What walks is
-thrown at it.
+thrown at it. With ``--layouts`` there are no episodes, but where things are after many resets, of
+all named tasks in one file.
 """
 
 import argparse
@@ -238,13 +239,31 @@ def layouts(name, count):
     return np.stack(rows), np.array(sorted(layout))
 
 
+def record_layouts(path, tasks):
+    """Layouts of many tasks, to a thousandth of a metre."""
+    rows = {}
+    for task, count in tasks:
+        rows[task], rows[f"{task}_names"] = layouts(f"{task}-v0", count)
+        rows[task] = rows[task].astype(np.float16)
+        print(task, rows[task].shape, flush=True)
+    np.savez_compressed(path, **rows)
+
+
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("folder", type=Path)
     parser.add_argument("--tasks", nargs="*", default=TASKS)
     parser.add_argument("--robots", nargs="*", default=ROBOTS)
+    parser.add_argument("--layouts", action="store_true")
     args = parser.parse_args()
     args.folder.mkdir(parents=True, exist_ok=True)
+    if args.layouts:
+        for robot in args.robots:
+            tasks = [
+                (f"Safety{robot}{task}", min(LAYOUTS.get(task, 150), 150)) for task in args.tasks
+            ]
+            record_layouts(args.folder / f"layouts_{robot}.npz", tasks)
+        return
     for robot in args.robots:
         for task in args.tasks:
             name = f"Safety{robot}{task}"

@@ -157,6 +157,11 @@ class BatchedEnv(EnvBase):
         self._core.seed(seed)
 
     @property
+    def episode_length(self) -> int:
+        """Steps after which an episode is truncated."""
+        return self._core.episode_length
+
+    @property
     def instabilities(self) -> int:
         """How many simulations diverged so far."""
         return self._core.instabilities

@@ -7,7 +7,7 @@ It runs in a Python of its own (see the README of this folder), not in that of t
 Per task there are a few short episodes. In each the robot is put in front of another kind of object
 and driven at it, so that costs, contacts and reached goals are among the steps. What walks is
 thrown at it. With ``--layouts`` there are no episodes, but where things are after many resets, of
-all named tasks in one file.
+all other robots in one file, to a thousandth of a metre.
 """
 
 import argparse
@@ -239,14 +239,30 @@ def layouts(name, count):
     return np.stack(rows), np.array(sorted(layout))
 
 
-def record_layouts(path, tasks):
-    """Layouts of many tasks, to a thousandth of a metre."""
-    rows = {}
-    for task, count in tasks:
-        rows[task], rows[f"{task}_names"] = layouts(f"{task}-v0", count)
-        rows[task] = rows[task].astype(np.float16)
-        print(task, rows[task].shape, flush=True)
-    np.savez_compressed(path, **rows)
+def record_layouts(folder, robots, tasks):
+    """Layouts of other robots than Point, and who has the same as another one of the same seeds."""
+    rows, same = {}, []
+    for task in tasks:
+        with np.load(folder / f"SafetyPoint{task}.npz") as file:
+            known = {f"SafetyPoint{task}": file["layouts"].astype(np.float16)}
+        for robot in robots:
+            name = f"Safety{robot}{task}"
+            if name in known:
+                continue
+            positions, names = layouts(f"{name}-v0", min(LAYOUTS.get(task, 150), 150))
+            positions = positions.astype(np.float16)
+            equal = [
+                other
+                for other in known
+                if np.array_equal(known[other][: len(positions)], positions)
+            ]
+            if equal:
+                same.append((name, equal[0]))
+            else:
+                rows[name], rows[f"{name}_names"] = positions, names
+                known[name] = positions
+            print(name, positions.shape, *equal)
+    np.savez_compressed(folder / "layouts.npz", same=np.array(same), **rows)
 
 
 def main():
@@ -258,11 +274,7 @@ def main():
     args = parser.parse_args()
     args.folder.mkdir(parents=True, exist_ok=True)
     if args.layouts:
-        for robot in args.robots:
-            tasks = [
-                (f"Safety{robot}{task}", min(LAYOUTS.get(task, 150), 150)) for task in args.tasks
-            ]
-            record_layouts(args.folder / f"layouts_{robot}.npz", tasks)
+        record_layouts(args.folder, args.robots, args.tasks)
         return
     for robot in args.robots:
         for task in args.tasks:

@@ -374,11 +374,7 @@ def calibration_scales(
     """
     if not 0 < low <= high:
         raise ValueError(f"low and high must be 0 < low <= high, got {low} and {high}.")
-    _check_batch("sums", sums, quantiles)
-    check_shape("weights", weights, quantiles.shape[-1:], "one per quantile")
-    if not len(quantiles):
-        raise ValueError("quantiles must be of at least one state, got none.")
-    quantiles, sums, weights = quantiles.double(), sums.double(), weights.double()
+    quantiles, sums, weights = _outcomes(quantiles, sums, weights)
     mean = quantiles.mean(-1)
     outcome = sums.mean()
     scale = 1.0
@@ -525,11 +521,7 @@ def calibration_slope(
     """
     if not low < high:
         raise ValueError(f"low must be less than high, got {low} and {high}.")
-    _check_batch("sums", sums, quantiles)
-    check_shape("weights", weights, quantiles.shape[-1:], "one per quantile")
-    if not len(quantiles):
-        raise ValueError("quantiles must be of at least one state, got none.")
-    quantiles, sums, weights = quantiles.double(), sums.double(), weights.double()
+    quantiles, sums, weights = _outcomes(quantiles, sums, weights)
     mean = quantiles.mean(-1)
     centre = mean.mean().item()
     if not centre > 0 or len(mean) < 2 or mean.min() == mean.max():
@@ -563,6 +555,15 @@ def _thresholds(quantiles: Tensor, weights: Tensor) -> tuple[Tensor, Tensor, Ten
     threshold = (ordered[..., index] + ordered[..., index + 1]) / 2
     share = 1 - (index + 1).to(weights) / num_quantiles
     return threshold, steps[index], share
+
+
+def _outcomes(quantiles: Tensor, sums: Tensor, weights: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Predictions, outcomes and the risk's weights, checked, in double precision."""
+    _check_batch("sums", sums, quantiles)
+    check_shape("weights", weights, quantiles.shape[-1:], "one per quantile")
+    if not len(quantiles):
+        raise ValueError("quantiles must be of at least one state, got none.")
+    return quantiles.double(), sums.double(), weights.double()
 
 
 def _check_batch(name: str, tensor: Tensor, quantiles: Tensor) -> None:

@@ -162,13 +162,10 @@ class CostSums:
                 losses = self.trainer.joined(self.losses, minibatch)
                 self._descent.step(losses)
         metrics = {f"update/{name}": value.item() for name, value in losses.items()}
+        metrics["update/skipped_cost_steps"] = float(self._descent.count())
         # Early, no sum is known to its end: then the half that is known best.
         enough = known > min(1 - 1 / math.e, 0.5 * known.max().item())
-        for cost, loss in self.losses.items():
-            report = loss.recalibrate(data[enough.flatten()], rate=RECALIBRATION_RATE)
-            for name, value in report.items():
-                metrics[self.trainer.name_of(f"calibration/{name}", cost)] = value.item()
-        return metrics | {"update/skipped_cost_steps": float(self._descent.count())}
+        return metrics | self._recalibrate(data[enough.flatten()], rate=RECALIBRATION_RATE)
 
     def calibrate(self) -> dict[str, float]:
         """Rescale predictions by new episodes of the policy that is handed over.
@@ -201,12 +198,17 @@ class CostSums:
         joined: TensorDictBase = torch.cat(data)
         shape = (len(joined), options.safety_critic.num_nets)
         joined["learned_by"] = torch.zeros(shape, dtype=torch.bool, device=joined.device)
-        metrics = {}
         for cost, loss in self.losses.items():
             self.scales.setdefault(cost, loss.scales.clone())
-            for name, value in loss.recalibrate(joined, stretch=True).items():
-                metrics[trainer.name_of(f"calibration/{name}", cost)] = value.item()
-        return metrics
+        return self._recalibrate(joined, stretch=True)
+
+    def _recalibrate(self, data: TensorDictBase, **how: Any) -> dict[str, float]:
+        """What was predicted and realised of each cost, by which its predictions are rescaled."""
+        return {
+            self.trainer.name_of(f"calibration/{name}", cost): value.item()
+            for cost, loss in self.losses.items()
+            for name, value in loss.recalibrate(data, **how).items()
+        }
 
     def take_back(self) -> None:
         """Scales as they were before :meth:`calibrate`."""

@@ -287,7 +287,11 @@ def _time_limit(env: EnvBase) -> int | None:
     elif isinstance(env, BatchedEnv):
         limits.append(env.episode_length)
     elif isinstance(env, BatchedEnvBase):
-        for make, kwargs in zip(env.create_env_fn, env.create_env_kwargs, strict=True):
+        kinds: list[tuple[Any, Any]] = []  # mostly one: each is made once, not each environment
+        for kind in zip(env.create_env_fn, env.create_env_kwargs, strict=True):
+            if kind not in kinds:
+                kinds.append(kind)
+        for make, kwargs in kinds:
             single = make(**kwargs)
             limits.append(_time_limit(single))
             single.close()

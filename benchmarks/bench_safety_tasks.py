@@ -21,7 +21,7 @@ from collections.abc import Callable
 
 import numpy as np
 import torch
-from mujoco.batch import Batch
+from floor import beside_the_floor
 
 from torchrl_safe.envs import SafeRobotEnv
 from torchrl_safe.envs._model import compile_model
@@ -30,7 +30,6 @@ from torchrl_safe.envs.tasks import SAFETY_TASKS, get_task
 torch.set_num_threads(1)
 
 NUM_ENVS, NUM_THREADS = 64, 2
-BLOCK = 16  # steps that the physics repeat at once: caches stay warm
 ENV, FLOOR, THEIRS = "env", "floor", "Safety-Gymnasium"
 Round = Callable[[float], dict[str, float]]
 
@@ -66,30 +65,9 @@ def ours(name: str) -> Round:
         episode_length=task.episode_length,
         stagger=True,
     )
-    floor = Batch(compile_model(robot, task.bodies), NUM_ENVS, NUM_THREADS)
-    control = floor.bind("ctrl")
-    td = env.reset()
-
-    def measure(seconds: float) -> dict[str, float]:
-        nonlocal td
-        steps, of_env, of_floor = 0, 0.0, 0.0
-        while of_env < seconds:
-            states = []
-            for _ in range(BLOCK):
-                td.update(env.full_action_spec.rand())
-                states.append((env._core._robots.state.copy(), td["action"].numpy()))
-                start = time.perf_counter()
-                _, td = env.step_and_maybe_reset(td)
-                of_env += time.perf_counter() - start
-            for state, action in states:
-                floor.state[:], control[:] = state, action
-                start = time.perf_counter()
-                floor.step(nstep=robot.substeps)
-                of_floor += time.perf_counter() - start
-            steps += NUM_ENVS * BLOCK
-        return {ENV: steps / of_env, FLOOR: steps / of_floor}
-
-    return measure
+    model = compile_model(robot, task.bodies)
+    rates = beside_the_floor(env, model, robot.substeps, NUM_THREADS)
+    return lambda seconds: dict(zip((ENV, FLOOR), rates(seconds), strict=True))
 
 
 def theirs(name: str, python: str) -> Round:

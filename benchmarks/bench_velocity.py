@@ -21,56 +21,31 @@ from collections.abc import Callable
 import gymnasium
 import mujoco
 import torch
-from mujoco.batch import Batch
+from floor import Clock, beside_the_floor
 
 from torchrl_safe.envs import VELOCITY_TASKS, SafeVelocityEnv, VelocityTask
 
 torch.set_num_threads(1)
 
 NUM_ENVS = 64
-BLOCK = 16  # steps that the physics repeat at once: caches stay warm
-Clock = Callable[[], float]
-Round = Callable[[Clock, float], dict[str, float]]
+Round = Callable[[float], dict[str, float]]
 
 
-def ours(task: VelocityTask, num_threads: int) -> Round:
+def ours(task: VelocityTask, num_threads: int, clock: Clock) -> Round:
     """Rates of the environment and of the physics that it makes."""
     env = SafeVelocityEnv(task, num_envs=NUM_ENVS, num_threads=num_threads, stagger=True)
-    floor = Batch(mujoco.MjModel.from_xml_path(str(task.asset_path)), NUM_ENVS, num_threads)
-    control = floor.bind("ctrl")
-    td = env.reset()
-
-    def measure(clock: Clock, seconds: float) -> dict[str, float]:
-        nonlocal td
-        steps, of_env, of_floor = 0, 0.0, 0.0
-        while of_env < seconds:
-            states = []
-            for _ in range(BLOCK):
-                td.update(env.full_action_spec.rand())
-                states.append((env._core._robots.state.copy(), td["action"].numpy()))
-                start = clock()
-                _, td = env.step_and_maybe_reset(td)
-                of_env += clock() - start
-            for state, action in states:
-                floor.state[:], control[:] = state, action
-                start = clock()
-                floor.step(nstep=task.frame_skip)
-                of_floor += clock() - start
-            steps += NUM_ENVS * BLOCK
-        return {
-            f"the floor, {num_threads}": steps / of_floor,
-            f"`SafeVelocityEnv`, {num_threads}": steps / of_env,
-        }
-
-    return measure
+    model = mujoco.MjModel.from_xml_path(str(task.asset_path))
+    rates = beside_the_floor(env, model, task.frame_skip, num_threads, clock)
+    rows = f"`SafeVelocityEnv`, {num_threads}", f"the floor, {num_threads}"
+    return lambda seconds: dict(zip(rows, rates(seconds), strict=True))
 
 
-def gymnasium_single(task: VelocityTask) -> Round:
+def gymnasium_single(task: VelocityTask, clock: Clock) -> Round:
     env = gymnasium.make(f"{task.title}-v4")
     env.reset(seed=0)
     actions = [env.action_space.sample() for _ in range(256)]
 
-    def measure(clock: Clock, seconds: float) -> dict[str, float]:
+    def measure(seconds: float) -> dict[str, float]:
         steps, start = 0, clock()
         while clock() - start < seconds:
             _, _, terminated, truncated, _ = env.step(actions[steps % 256])
@@ -82,12 +57,12 @@ def gymnasium_single(task: VelocityTask) -> Round:
     return measure
 
 
-def gymnasium_vector(task: VelocityTask) -> Round:
+def gymnasium_vector(task: VelocityTask, clock: Clock) -> Round:
     envs = gymnasium.make_vec(f"{task.title}-v4", num_envs=NUM_ENVS, vectorization_mode="sync")
     envs.reset(seed=0)
     actions = [envs.action_space.sample() for _ in range(64)]
 
-    def measure(clock: Clock, seconds: float) -> dict[str, float]:
+    def measure(seconds: float) -> dict[str, float]:
         steps, start = 0, clock()
         while clock() - start < seconds:
             envs.step(actions[steps % 64])
@@ -102,10 +77,9 @@ def measure(
 ) -> list[dict[str, float]]:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # there is a version 5
-        rows = [ours(task, 1), ours(task, 2), gymnasium_single(task), gymnasium_vector(task)]
-        rates = [
-            {k: v for row in rows for k, v in row(clock, seconds).items()} for _ in range(rounds)
-        ]
+        rows = [ours(task, 1, clock), ours(task, 2, clock)]
+        rows += [gymnasium_single(task, clock), gymnasium_vector(task, clock)]
+        rates = [{k: v for row in rows for k, v in row(seconds).items()} for _ in range(rounds)]
     return rates[1:]  # the first round warms up
 
 

@@ -107,19 +107,14 @@ def readme_results() -> str:
 
 
 def readme_speed() -> str:
-    """Frames per second of the runs of the table, and of the others' that is recorded."""
+    """Frames per second of the runs of the table."""
     speeds = [
         json.loads(path.with_name("results.json").read_text())["frames_per_second"]
         for path in learning_curves()
     ]
-    recorded = re.search(
-        r"CPO of (OmniSafe) [\d.]+ \(recorded elsewhere\) \| (\d+) \|",
-        (ROOT / "docs" / "benchmarks.md").read_text(),
-    )
-    assert recorded, "docs/benchmarks.md has OmniSafe's speed"
     return wrap(
         f"These runs made {statistics.median(speeds):,.0f} frames/s on one thread of a busy "
-        f"machine. CPO of {recorded[1]} made {recorded[2]} on a comparable one."
+        "machine."
     )
 
 

@@ -34,7 +34,7 @@ def arguments(words: list[str] | None = None) -> argparse.Namespace:
     add("--robot", default="point")
     add("--seed", type=int, default=0)
     add("--num-envs", type=int, default=400)
-    add("--episode-length", type=int, default=250, help="steps")
+    add("--episode-length", type=int, default=125, help="steps")
     add("--frames-per-batch", type=int, default=8000, help="frames between two updates")
     add("--total-frames", type=int, default=1_000_000)
     add("--init-frames", type=int, default=20_000, help="before the first update")

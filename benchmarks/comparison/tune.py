@@ -23,19 +23,16 @@ from spaces import ROWS
 ROBOT = "point"
 
 
+def trial(plan: Plan, row: str, number: int, frames: int, seed: int) -> Training:
+    """A training of what a trial's number draws."""
+    drawn = ROWS[row].draw(number)
+    return training(plan, ROBOT, "tuning", row, f"trial_{number:02d}", frames, seed, drawn)
+
+
 def trials(plan: Plan, row: str) -> list[Training]:
     """The random trials of a row."""
     return [
-        training(
-            plan,
-            ROBOT,
-            "tuning",
-            row,
-            f"trial_{number:02d}",
-            plan.trial_frames,
-            plan.trial_seed + number,
-            ROWS[row].draw(number),
-        )
+        trial(plan, row, number, plan.trial_frames, plan.trial_seed + number)
         for number in range(plan.trials)
     ]
 
@@ -52,16 +49,7 @@ def best_trials(there: Comparison, row: str) -> list[int] | None:
 def again(plan: Plan, row: str, numbers: Sequence[int]) -> list[Training]:
     """Trials once more, longer and with more seeds."""
     return [
-        training(
-            plan,
-            ROBOT,
-            "tuning",
-            row,
-            f"trial_{number:02d}",
-            plan.frames,
-            seed,
-            ROWS[row].draw(number),
-        )
+        trial(plan, row, number, plan.frames, seed)
         for number in numbers
         for seed in plan.best_seeds
     ]

@@ -6,7 +6,8 @@ It runs in a Python of its own (see the README of this folder), not in that of t
 
 Per task there are a few short episodes. In each the robot is put in front of another kind of object
 and driven at it, so that costs, contacts and reached goals are among the steps. What walks is
-thrown at it.
+thrown at it. With ``--layouts`` there are no episodes, but where things are after many resets, of
+all other robots in one file, to a thousandth of a metre.
 """
 
 import argparse
@@ -238,13 +239,43 @@ def layouts(name, count):
     return np.stack(rows), np.array(sorted(layout))
 
 
+def record_layouts(folder, robots, tasks):
+    """Layouts of other robots than Point, and who has the same as another one of the same seeds."""
+    rows, same = {}, []
+    for task in tasks:
+        with np.load(folder / f"SafetyPoint{task}.npz") as file:
+            known = {f"SafetyPoint{task}": file["layouts"].astype(np.float16)}
+        for robot in robots:
+            name = f"Safety{robot}{task}"
+            if name in known:
+                continue
+            positions, names = layouts(f"{name}-v0", min(LAYOUTS.get(task, 150), 150))
+            positions = positions.astype(np.float16)
+            equal = [
+                other
+                for other in known
+                if np.array_equal(known[other][: len(positions)], positions)
+            ]
+            if equal:
+                same.append((name, equal[0]))
+            else:
+                rows[name], rows[f"{name}_names"] = positions, names
+                known[name] = positions
+            print(name, positions.shape, *equal)
+    np.savez_compressed(folder / "layouts.npz", same=np.array(same), **rows)
+
+
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("folder", type=Path)
     parser.add_argument("--tasks", nargs="*", default=TASKS)
     parser.add_argument("--robots", nargs="*", default=ROBOTS)
+    parser.add_argument("--layouts", action="store_true")
     args = parser.parse_args()
     args.folder.mkdir(parents=True, exist_ok=True)
+    if args.layouts:
+        record_layouts(args.folder, args.robots, args.tasks)
+        return
     for robot in args.robots:
         for task in args.tasks:
             name = f"Safety{robot}{task}"

@@ -12,6 +12,7 @@ from torchrl_safe.envs._random import RandomStreams
 from torchrl_safe.envs.robots import Motion, to_robot_frame
 from torchrl_safe.envs.tasks import goal as tasks
 from torchrl_safe.envs.tasks.base import goal_reward
+from torchrl_safe.envs.tasks.layout import scatter
 
 KEEPOUT = 0.4
 
@@ -71,6 +72,23 @@ class TestStreams:
             RandomStreams(-1, 2)
 
 
+def one_attempt(keepout: list[float], extent: float, tries: np.ndarray) -> list[list[float]]:
+    """Places of the objects, up to the first that finds none among its tries [K, C, 2]."""
+    placed: list[list[float]] = []
+    for own, places in zip(keepout, tries.tolist(), strict=True):
+        for place in places:
+            x, y = ((extent - own) * number for number in place)
+            if all(
+                math.hypot(x - u, y - v) >= own + other
+                for (u, v), other in zip(placed, keepout, strict=False)
+            ):
+                placed.append([x, y])
+                break
+        else:
+            break
+    return placed
+
+
 class TestLayout:
     def test_is_legal(self):
         num_envs = 3000
@@ -113,6 +131,29 @@ class TestLayout:
             alone = tasks.sample_layout(task, KEEPOUT, RandomStreams(5, 40), np.array([row]))
             for x, y in zip(full, alone, strict=True):
                 assert (x[row] == y[0]).all()
+
+    @pytest.mark.parametrize(
+        ("keepout", "extent", "candidates", "num"),
+        [
+            ([0.4] + [0.2] * 4 + [0.4] + [0.18] * 4 + [0.4] * 4, 1.5, 100, 6),  # Button's, level 1
+            ([0.3] * 7, 1.1, 32, 60),
+            ([0.2] * 3, 2.0, 32, 60),
+        ],
+    )
+    def test_is_what_one_try_after_the_other_gives(self, keepout, extent, candidates, num):
+        """Attempts that are made at once use the numbers that attempts in a row would have used."""
+        streams, same = RandomStreams(4, num), RandomStreams(4, num)
+        layouts = [scatter(np.array(keepout), extent, streams, np.arange(num), candidates)]
+        layouts.append(scatter(np.array(keepout), extent, streams, np.arange(num), candidates))
+        for layout in layouts:
+            for row in range(num):
+                placed = []
+                while len(placed) < len(keepout):
+                    numbers = same.uniform(np.array([row]), 2 * len(keepout) * candidates)[0]
+                    tries = numbers.reshape(len(keepout), candidates, 2) * 2.0 - 1.0
+                    placed = one_attempt(keepout, extent, tries)
+                assert layout[row].tolist() == placed
+        assert (streams.state == same.state).all()
 
     def test_without_hazards(self):
         hazards = tasks.sample_layout(

@@ -14,6 +14,7 @@ from scipy import integrate, optimize, stats
 
 from torchrl_safe.objectives.distribution import (
     calibration_scales,
+    calibration_slope,
     cvar_distortion,
     draw_from_quantiles,
     project_to_quantiles,
@@ -24,6 +25,7 @@ from torchrl_safe.objectives.distribution import (
     rescale_quantiles,
     spectral_risk,
     spectral_weights,
+    stretch_quantiles,
 )
 from torchrl_safe.objectives.functional import gaussian_cvar
 
@@ -317,6 +319,81 @@ class TestScales:
         given = {"quantiles": torch.ones(3, 4), "sums": torch.ones(3, 1), "weights": torch.ones(4)}
         with pytest.raises(ValueError, match=message):
             calibration_scales(**given | change)
+
+
+class TestSlope:
+    """How far apart states stand, against what they were pulled together by, and brute force."""
+
+    WEIGHTS = TestScales.WEIGHTS
+
+    def true(self):
+        """States of exponential outcomes of means from .1 to 10: quantiles, and one outcome."""
+        mean = 10 ** (2 * torch.rand(40_000, 1, generator=torch.Generator().manual_seed(0)) - 1)
+        cells = -torch.log1p(-quantile_levels(64).double())
+        quantiles = mean.double() * cells / cells.mean()
+        rank = torch.randint(64, (40_000, 1), generator=torch.Generator().manual_seed(1))
+        return quantiles, quantiles.gather(1, rank)
+
+    def test_a_power_of_the_mean(self):
+        quantiles = rand(5, 7).exp()
+        stretched = stretch_quantiles(quantiles, 0.5, 3.0)
+        mean = quantiles.mean(-1)
+        torch.testing.assert_close(stretched.mean(-1), mean**1.5 / 3**0.5)
+        torch.testing.assert_close(stretched.std(-1) / stretched.mean(-1), quantiles.std(-1) / mean)
+        assert stretch_quantiles(quantiles, 0.0, 1.0).equal(quantiles)
+        assert stretch_quantiles(torch.zeros(2, 3), 0.5, 1.0).equal(torch.zeros(2, 3))
+
+    @pytest.mark.parametrize("power", [0.7, 1.0, 1.25])
+    def test_finds_what_pulled_states_together(self, power):
+        quantiles, sums = self.true()
+        mean = quantiles.mean(-1, keepdim=True)
+        pulled = quantiles / mean * mean**power
+        slope, centre = calibration_slope(pulled, sums, self.WEIGHTS)
+        assert slope == pytest.approx(1 / power - 1, abs=0.03)
+        assert centre == pytest.approx(pulled.mean().item())
+
+    def test_grid(self):
+        """The slope at which both halves are wrong by the same share."""
+        weights = spectral_weights(8, torch.square)
+        quantiles, sums = rand(50, 8).exp(), rand(50, 3, seed=1).exp()
+        half = quantiles.mean(-1).argsort().argsort() < 25
+
+        def gap(slope: float) -> float:
+            stretched = stretch_quantiles(quantiles, slope, quantiles.mean())
+            scales = calibration_scales(stretched, sums, weights)
+            right = rescale_quantiles(stretched, *scales)
+            risk, realised = spectral_risk(right, weights), realised_risk(sums, right, weights)
+            shares = [risk[each].mean() / realised[each].mean() for each in (half, ~half)]
+            return abs((shares[0] - shares[1]).item())
+
+        slope, _ = calibration_slope(quantiles, sums, weights)
+        grid = np.linspace(-0.5, 1, 301)
+        assert slope == pytest.approx(grid[int(np.argmin([gap(x) for x in grid]))], abs=0.01)
+
+    def test_nothing_to_learn(self):
+        weights = torch.tensor([0.0, 1.0])
+        two = torch.tensor([[1.0, 1.0], [2.0, 2.0]])
+        for quantiles, sums in (
+            (torch.ones(4, 2), torch.ones(4, 1)),  # all alike
+            (torch.zeros(4, 2), torch.ones(4, 1)),
+            (torch.ones(1, 2), torch.ones(1, 1)),
+            (two, torch.tensor([[0.0], [1.0]])),  # nothing happened to the better half
+        ):
+            assert calibration_slope(quantiles, sums, weights) == (0.0, 1.0)
+
+    @pytest.mark.parametrize(
+        ("change", "message"),
+        [
+            ({"sums": torch.zeros(2, 1)}, "sums must have the batch shape"),
+            ({"weights": torch.ones(3)}, "weights must have shape"),
+            ({"low": 1.0}, "low must be less than high, got 1.0 and 1.0"),
+            ({"quantiles": torch.zeros(0, 4), "sums": torch.zeros(0, 1)}, "at least one state"),
+        ],
+    )
+    def test_refuses(self, change, message):
+        given = {"quantiles": torch.ones(3, 4), "sums": torch.ones(3, 1), "weights": torch.ones(4)}
+        with pytest.raises(ValueError, match=message):
+            calibration_slope(**given | change)
 
 
 class TestProjection:

@@ -53,6 +53,17 @@ def constant_critic(values):
     return ValueOperator(Constant(values), **keys)
 
 
+class Spread(nn.Module):
+    """Quantiles around the first number of the observation."""
+
+    def __init__(self):
+        super().__init__()
+        self.around = nn.Parameter(torch.tensor([0.5, 1.5], dtype=torch.float64))
+
+    def forward(self, observation, action):
+        return observation[..., :1] * self.around
+
+
 def make_loss(cost_limit=2.5, gamma=0.9, critic=None, estimator=None, **kwargs):
     torch.manual_seed(0)
     critic = make_critic() if critic is None else critic
@@ -609,6 +620,26 @@ class TestRecalibration:
         close(loss.cvar(data, data["action"]), torch.full((4,), 12.0).double(), rtol=1e-5, atol=0)
         again = loss.recalibrate(data)
         assert again["predicted_risk"] == pytest.approx(again["realised_risk"].item(), rel=1e-5)
+
+    def test_stretch(self):
+        """A critic of means 1 and 3 where they are 1 and 9: of the centre 2 they stand apart."""
+        critic = ValueOperator(
+            Spread(), in_keys=["observation", "action"], out_keys=["cost_quantiles"]
+        )
+        loss = make_loss(critic=critic, risk_level=1.0)
+        data = self.data([[False]] * 2, [1.0, 9.0])
+        data["observation"] = torch.tensor([[1.0], [3.0]]).expand(2, OBS).double()
+        loss.recalibrate(data)
+        assert loss.stretch.tolist() == [0.0, 1.0]  # not unasked
+        loss.recalibrate(data, stretch=True)
+        slope, centre = loss.stretch.tolist()
+        assert (slope, centre) == (pytest.approx(1.0, abs=1e-3), 2.0)
+        mean, _ = loss.predict(data, data["action"])
+        close(mean, torch.tensor([1.0, 9.0]).double(), rtol=1e-2, atol=0)
+        close(loss.cvar(data, data["action"]), mean)
+        other = make_loss(critic=critic, risk_level=1.0)
+        other.load_state_dict(loss.state_dict())
+        assert other.stretch.equal(loss.stretch)
 
     def test_moves_by_its_rate(self):
         loss = self.loss()

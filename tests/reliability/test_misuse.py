@@ -1621,6 +1621,7 @@ IMPOSSIBLE = {
     "safety_critic.num_nets": (5, "at most 4"),
     "safety_critic.window": (1, "at least 2"),
     "safety_critic.num_updates": (0, "at least 1"),
+    "safety_critic.calibration_frames": (-1, "at least 0"),
     "env.name": ("", "a name"),
     "env.task": ("chess", "or a task of Safety-Gymnasium's"),
     "env.id": ("", "null or a name"),

@@ -144,6 +144,60 @@ class TestLeftOut:
         assert loss.scales[1] > 1.2  # the spread was too small
 
 
+class TestHandOver:
+    def test_predicts_what_new_episodes_cost(self, trainer):
+        """The risk of the last policy, whatever the critic had learned."""
+        trainer.options = trainer.options.changed(
+            **{"eval.num_steps": 40, "safety_critic.calibration_frames": 640}
+        )
+        trainer.cost_sums.extend(steps(3 * torch.rand(N, 6), ends=True))
+        trainer.cost_sums.fit()  # of costs that the episodes will not have
+        (loss,) = trainer.cost_losses.values()
+        before = loss.scales.clone()
+        first = trainer.cost_sums.calibrate()
+        assert first["calibration/predicted_mean"] != pytest.approx(
+            first["calibration/realised_mean"], rel=0.05
+        )
+        random_state = torch.get_rng_state()
+        again = trainer.cost_sums.calibrate()  # of the same episodes
+        assert torch.get_rng_state().equal(random_state)
+        assert again["calibration/realised_mean"] == first["calibration/realised_mean"]
+        for name in ("mean", "risk"):
+            predicted, realised = (
+                again[f"calibration/{kind}_{name}"] for kind in ("predicted", "realised")
+            )
+            assert predicted == pytest.approx(realised, rel=1e-3)
+        trainer.cost_sums.calibrate()
+        trainer.cost_sums.take_back()
+        assert loss.scales.equal(before)
+        assert loss.stretch.tolist() == [0.0, 1.0]
+
+    @pytest.mark.parametrize(
+        ("frames", "expected"), [(0, (1, 0)), (39, (1, 0)), (40, (1, 1)), (400, (4, 2))]
+    )
+    def test_as_many_steps_as_asked_for(self, trainer, frames, expected):
+        trainer.options = trainer.options.changed(
+            **{"eval.num_steps": 40, "safety_critic.calibration_frames": frames}
+        )
+        num_envs, num_steps, rounds = trainer.cost_sums.episodes()
+        assert num_steps == 40
+        assert (num_envs, rounds) == expected
+
+    def test_half_as_many_as_in_training(self, trainer):
+        trainer.options = trainer.options.changed(
+            **{
+                "eval.num_steps": 1000,
+                "collector.total_frames": 100_000,
+                "collector.frames_per_batch": 400,
+                "env.num_envs": 40,
+            }
+        )
+        # What a step is followed by for 2 % of its weight: 390 steps at .99, beside 100 judged.
+        assert trainer.cost_sums.episodes() == (40, 490, 2)
+        trainer.options = trainer.options.changed(**{"collector.total_frames": 10_000_000})
+        assert trainer.cost_sums.episodes() == (40, 490, 25)
+
+
 def test_continues_exactly(tmp_path):
     """A run in two parts is the run in one, to the last bit."""
     tiny.launch(tmp_path / "whole", *QUANTILES, "collector.total_frames=400")

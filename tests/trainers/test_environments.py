@@ -5,14 +5,15 @@ from __future__ import annotations
 import math
 from functools import partial
 
+import gymnasium
 import pytest
 import small
 import torch
 from torch import nn
-from torchrl.envs import GymEnv, ParallelEnv, SerialEnv, StepCounter, TransformedEnv
+from torchrl.envs import GymEnv, GymWrapper, ParallelEnv, SerialEnv, StepCounter, TransformedEnv
 
 from torchrl_safe import record
-from torchrl_safe.envs import CostFunction
+from torchrl_safe.envs import CostFunction, SafeRobotEnv
 from torchrl_safe.trainers import CPO, METHODS, TRC, SafeTAC, load_policy
 from torchrl_safe.trainers.environments import UntrustedError, make_env
 
@@ -24,6 +25,12 @@ def speed(step):
 
 def pendulum():
     return TransformedEnv(GymEnv("Pendulum-v1"), CostFunction(speed))
+
+
+def several_pendulums(num_envs):
+    mode = {"autoreset_mode": gymnasium.vector.AutoresetMode.DISABLED}
+    envs = gymnasium.make_vec("Pendulum-v1", num_envs, vector_kwargs=mode)
+    return TransformedEnv(GymWrapper(envs), CostFunction(speed))
 
 
 def cart():
@@ -111,8 +118,14 @@ class TestCommandLine:
 
     @pytest.mark.parametrize(
         ("make", "longest"),
-        [(pendulum, 200), (lambda: pendulum().append_transform(StepCounter(max_steps=150)), 150)],
-        ids=["gymnasium", "step counter"],
+        [
+            (pendulum, 200),
+            (lambda: pendulum().append_transform(StepCounter(max_steps=150)), 150),
+            (lambda: SerialEnv(2, pendulum), 200),
+            (several_pendulums, 200),
+            (lambda num_envs: SafeRobotEnv("point", num_envs=num_envs, episode_length=90), 90),
+        ],
+        ids=["gymnasium", "step counter", "serial", "vector", "ours"],
     )
     def test_limit_of_longer_episodes_than_there_are(self, tmp_path, make, longest):
         """A sum over steps that no episode has is a looser limit than the one that is read."""

@@ -45,8 +45,7 @@ class TestWhatFollows:
             assert env.action_spec.shape[1:] == registered.action_space.shape
             steps = registered.spec.max_episode_steps
         assert options.eval.num_steps == options.video.num_steps == steps
-        endless = any(family in name for family in ("Goal", "Button", "Push"))
-        assert options.env.episode_length == (250 if endless else steps)
+        assert options.env.episode_length == steps
         assert options.env.robot is None
 
     def test_fields_problem(self):
@@ -134,7 +133,7 @@ def test_sweep_over_tasks(tmp_path, monkeypatch):
     tasks = "env.task=SafetyPointCircle1,SafetyCarGoal1,SafetySwimmerVelocity"
     cli.train("cpo", ["--multirun", tasks, "loss.cost_limit=5.0"])
     assert [options.eval.num_steps for options in seen] == [500, 1000, 1000]
-    assert [options.env.episode_length for options in seen] == [500, 250, 1000]
+    assert [options.env.episode_length for options in seen] == [500, 1000, 1000]
     assert {options.loss.cost_limit for options in seen} == {5.0}
 
 

@@ -9,12 +9,14 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import DTypeLike, NDArray
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDict, TensorDictBase, is_tensor_collection
 from torchrl.data import Binary, Bounded, Composite, TensorSpec, Unbounded
 from torchrl.envs import EnvBase
 
 from torchrl_safe._costs import cost_key
 from torchrl_safe.envs._core import Core
+
+_OF_A_STEP = ("next", "_reset")  # entries that the next step does not start from
 
 
 class BatchedEnv(EnvBase):
@@ -89,32 +91,75 @@ class BatchedEnv(EnvBase):
         action = tensordict.get("action").detach().cpu().numpy()
         return self._to_tensordict(self._core.step(action), stepped=True)
 
+    def step_and_maybe_reset(
+        self, tensordict: TensorDictBase
+    ) -> tuple[TensorDictBase, TensorDictBase]:
+        """A step, and new episodes where it ended some: what a collector calls.
+
+        The same as TorchRL's own, entry by entry, but a reset shows all environments as they are,
+        so that nothing has to be merged.
+
+        Args:
+            tensordict (TensorDict): with the ``"action"``; gets what the step brought as
+                ``"next"``.
+
+        Returns:
+            tuple of TensorDicts: the one that was given, and what the next step starts from.
+        """
+        if tensordict.device != self.device:
+            tensordict = tensordict.to(self.device)
+        keys = tensordict.keys()
+        if "next" in keys or "_step" in keys or tensordict.batch_size != self.batch_size:
+            return super().step_and_maybe_reset(tensordict)
+        stepped = self._step(tensordict)
+        tensordict.set("next", stepped)
+        shown = dict(stepped.items())
+        kept = {k: v for k, v in tensordict.items() if k not in shown and k not in _OF_A_STEP}
+        done = stepped.get("done")
+        if done.any():
+            shown = dict(self._reset(self._tensordict({"_reset": done})).items())
+            if not done.all():  # a new episode knows nothing of what a policy left
+                none = self._tensordict({})
+                kept = dict(self._tensordict(kept).where(~done[:, 0], none, pad=0).items())
+        following = {k: v.copy() if is_tensor_collection(v) else v for k, v in kept.items()} | shown
+        for name in self.reward_keys:
+            following.pop(name, None)
+        return tensordict, self._tensordict(following)
+
+    def _tensordict(self, entries: dict[str, Any]) -> TensorDict:
+        # As TorchRL's own environments do: checking the entries takes longer than computing some.
+        return TensorDict._new_unsafe(entries, batch_size=self.batch_size, device=self.device)
+
     def _step_proc_data(self, next_tensordict_out: TensorDictBase) -> TensorDictBase:
         # What would be completed and reshaped here leaves _step complete and in shape.
         return next_tensordict_out
 
     def _to_tensordict(self, frame: Any, *, stepped: bool) -> TensorDictBase:
-        signals = self._core.signals(frame)
         # Copies: whoever gets these tensors may write to them.
-        source = {
-            "observation": torch.from_numpy(frame.observation.astype(np.float32)),
-            **{k: _column(v) for k, v in signals.items() if k not in self._costs},
-            "diverged": _column(frame.diverged),
-            "done": _column(frame.terminated | frame.truncated),
-            "terminated": _column(frame.terminated),
-            "truncated": _column(frame.truncated),
-        }
+        source = {"observation": torch.from_numpy(frame.observation.astype(np.float32))}
+        for name, value in self._core.signals(frame).items():
+            if name not in self._costs:
+                source[name] = _column(value)
+            elif stepped:
+                source[name] = _column(value, np.float32)
         if stepped:
             source["reward"] = _column(frame.reward, np.float32)
-            source |= {k: _column(v, np.float32) for k, v in signals.items() if k in self._costs}
+        source["diverged"] = _column(frame.diverged)
+        source["done"] = _column(frame.terminated | frame.truncated)
+        source["terminated"] = _column(frame.terminated)
+        source["truncated"] = _column(frame.truncated)
         device = self.device
         if device is not None and device.type != "cpu":
             source = {key: value.to(device) for key, value in source.items()}
-        # As TorchRL's own environments do: checking the entries takes longer than computing some.
-        return TensorDict._new_unsafe(source, batch_size=self.batch_size, device=device)
+        return self._tensordict(source)
 
     def _set_seed(self, seed: int | None) -> None:
         self._core.seed(seed)
+
+    @property
+    def episode_length(self) -> int:
+        """Steps after which an episode is truncated."""
+        return self._core.episode_length
 
     @property
     def instabilities(self) -> int:

@@ -144,7 +144,8 @@ class SimulationPool:
             failed |= self._warning[:, _DIVERGED, 1].any(-1)
         for value in (self._qpos, self._qvel, self._qacc):
             # MuJoCo looks at the states that physics steps start from only. NaN compares false.
-            failed |= ~(np.abs(value).max(-1) < mujoco.mjMAXVAL)
+            if not np.abs(value).max() < mujoco.mjMAXVAL:
+                failed |= ~(np.abs(value).max(-1) < mujoco.mjMAXVAL)
         if failed.any():
             batch.state[failed] = self._before[failed]
             self._warning[failed] = 0

@@ -47,23 +47,32 @@ class RandomStreams:
 
     def uniform(self, rows: NDArray[np.integer], count: int) -> NDArray[np.float64]:
         """The next ``count`` numbers in [0, 1) of each stream in ``rows``: [len(rows), count]."""
-        numbers = self.peek(rows, np.zeros(len(rows), np.int64), count)
+        numbers = self.peek(rows[:, None], np.arange(count))
         self.skip(rows, count)
         return numbers
 
     def peek(
-        self, rows: NDArray[np.integer], ahead: NDArray[np.integer], count: int
+        self,
+        rows: NDArray[np.integer],
+        which: NDArray[np.integer],
+        ahead: NDArray[np.integer] | int = 0,
     ) -> NDArray[np.float64]:
-        """As :meth:`uniform`, of the numbers that follow the next ``ahead`` [n], drawing none.
+        """Of the streams ``rows`` the numbers ``which``, counted from the next one, drawing none.
 
-        Rows may come more than once.
+        All are broadcast, and rows may come more than once. The next ``ahead`` numbers are left
+        out of the count.
         """
-        steps = np.arange(1, count + 1, dtype=np.uint64)
-        z = self.state[rows, None] + (ahead.astype(np.uint64)[:, None] + steps) * _INCREMENT
-        z = (z ^ (z >> np.uint64(30))) * _MIX_1
-        z = (z ^ (z >> np.uint64(27))) * _MIX_2
-        z ^= z >> np.uint64(31)
-        return (z >> np.uint64(11)) * 2.0**-53
+        first = self.state[rows] + np.asarray(ahead).astype(np.uint64) * _INCREMENT
+        z = first + (which + 1).astype(np.uint64) * _INCREMENT
+        # In place: memory that is asked for anew costs more than the arithmetic.
+        high = z >> np.uint64(30)
+        for factor, shift in ((_MIX_1, 27), (_MIX_2, 31)):
+            z ^= high
+            z *= factor
+            np.right_shift(z, np.uint64(shift), out=high)
+        z ^= high
+        z >>= np.uint64(11)
+        return z * 2.0**-53
 
     def skip(self, rows: NDArray[np.integer], count: int | NDArray[np.integer]) -> None:
         """Leaves out the next ``count`` numbers, one for all or [n], of each stream in ``rows``."""

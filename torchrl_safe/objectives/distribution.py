@@ -306,6 +306,35 @@ def rescale_quantiles(
     return mean_scale * mean + spread_scale * (quantiles - mean)
 
 
+def stretch_quantiles(quantiles: Tensor, slope: float | Tensor, centre: float | Tensor) -> Tensor:
+    r"""Quantiles of states that stand further apart, or closer together, than they were.
+
+    .. math::
+
+        q'_i = q_i \left(\bar q / c\right)^{b}
+
+    A distribution whose mean is the centre :math:`c` stays. With a positive slope :math:`b` worse
+    ones become worse, and better ones better.
+
+    Args:
+        quantiles (Tensor): :math:`q`, ``[*B, N]``, in any order. A mean below a millionth of the
+            centre counts as that.
+        slope (float or Tensor): :math:`b`, a scalar.
+        centre (float or Tensor): :math:`c`, a positive scalar.
+
+    Returns:
+        Tensor: ``[*B, N]``, in the same order.
+
+    Examples:
+        >>> import torch
+        >>> stretch_quantiles(torch.tensor([[1.0, 3.0], [4.0, 4.0]]), 0.5, 4.0).round(decimals=3)
+        tensor([[0.7070, 2.1210],
+                [4.0000, 4.0000]])
+    """
+    relative = quantiles.mean(-1, keepdim=True) / centre
+    return quantiles * relative.clamp(min=1e-6) ** slope
+
+
 def calibration_scales(
     quantiles: Tensor, sums: Tensor, weights: Tensor, *, low: float = 0.125, high: float = 8.0
 ) -> tuple[float, float]:
@@ -345,11 +374,7 @@ def calibration_scales(
     """
     if not 0 < low <= high:
         raise ValueError(f"low and high must be 0 < low <= high, got {low} and {high}.")
-    _check_batch("sums", sums, quantiles)
-    check_shape("weights", weights, quantiles.shape[-1:], "one per quantile")
-    if not len(quantiles):
-        raise ValueError("quantiles must be of at least one state, got none.")
-    quantiles, sums, weights = quantiles.double(), sums.double(), weights.double()
+    quantiles, sums, weights = _outcomes(quantiles, sums, weights)
     mean = quantiles.mean(-1)
     outcome = sums.mean()
     scale = 1.0
@@ -458,6 +483,68 @@ def draw_from_quantiles(
     return quantiles.sort(-1).values.gather(-1, index.clamp(max=num_quantiles - 1))
 
 
+def calibration_slope(
+    quantiles: Tensor, sums: Tensor, weights: Tensor, *, low: float = -0.5, high: float = 1.0
+) -> tuple[float, float]:
+    """How quantiles of states must be stretched until good and bad states are judged alike.
+
+    Scales make predictions right on average over states (:func:`calibration_scales`). They can
+    still be too high for states that are judged better than most, and too low for the others. With
+    the slope, and scales that are found after it, predicted over realised risk is the same for the
+    half of the states that is judged better and for the other.
+
+    Args:
+        quantiles (Tensor): predicted, ``[B, N]``, in any order.
+        sums (Tensor): outcomes that the critic has not learned, ``[B, K]``, equally likely.
+        weights (Tensor): ``[N]``, of the sorted quantiles, see :func:`spectral_weights`.
+
+    Keyword Args:
+        low (float): smallest slope. Defaults to -1 / 2.
+        high (float): largest slope. Defaults to 1.
+
+    Returns:
+        tuple of float: slope and centre, for :func:`stretch_quantiles`; 0 and 1 where there is
+        nothing to learn: all predictions are alike, or nothing happened to one of the halves.
+
+    Raises:
+        ValueError: if shapes disagree, there is no state, or not ``low < high``.
+
+    Examples:
+        Means 1 and 4 were predicted, of states whose costs are 1 and 16:
+
+        >>> import torch
+        >>> quantiles = torch.tensor([[1.0, 1.0], [4.0, 4.0]])
+        >>> sums = torch.tensor([[1.0], [16.0]])
+        >>> slope, centre = calibration_slope(quantiles, sums, torch.tensor([0.5, 0.5]), high=2.0)
+        >>> round(slope, 3), centre
+        (1.0, 2.5)
+    """
+    if not low < high:
+        raise ValueError(f"low must be less than high, got {low} and {high}.")
+    quantiles, sums, weights = _outcomes(quantiles, sums, weights)
+    mean = quantiles.mean(-1)
+    centre = mean.mean().item()
+    if not centre > 0 or len(mean) < 2 or mean.min() == mean.max():
+        return 0.0, 1.0
+    order = mean.argsort()
+    better, worse = order[: len(order) // 2], order[len(order) // 2 :]
+    if not (sums[better].mean() > 0 and sums[worse].mean() > 0):
+        return 0.0, 1.0
+
+    def too_low(slope: float) -> bool:
+        """Whether the better half is still judged too high, beside the worse one."""
+        stretched = stretch_quantiles(quantiles, slope, centre)
+        judged = rescale_quantiles(stretched, *calibration_scales(stretched, sums, weights))
+        predicted, realised = spectral_risk(judged, weights), realised_risk(sums, judged, weights)
+        shares = [predicted[half].mean() / realised[half].mean() for half in (better, worse)]
+        return bool(shares[0] > shares[1])
+
+    for _ in range(12):
+        middle = (low + high) / 2
+        low, high = (middle, high) if too_low(middle) else (low, middle)
+    return (low + high) / 2, centre
+
+
 def _thresholds(quantiles: Tensor, weights: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Where the spectrum rises: values there ``[*B, J]``, by how much, and the share above."""
     num_quantiles = quantiles.shape[-1]
@@ -468,6 +555,15 @@ def _thresholds(quantiles: Tensor, weights: Tensor) -> tuple[Tensor, Tensor, Ten
     threshold = (ordered[..., index] + ordered[..., index + 1]) / 2
     share = 1 - (index + 1).to(weights) / num_quantiles
     return threshold, steps[index], share
+
+
+def _outcomes(quantiles: Tensor, sums: Tensor, weights: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Predictions, outcomes and the risk's weights, checked, in double precision."""
+    _check_batch("sums", sums, quantiles)
+    check_shape("weights", weights, quantiles.shape[-1:], "one per quantile")
+    if not len(quantiles):
+        raise ValueError("quantiles must be of at least one state, got none.")
+    return quantiles.double(), sums.double(), weights.double()
 
 
 def _check_batch(name: str, tensor: Tensor, quantiles: Tensor) -> None:

@@ -24,6 +24,7 @@ from torchrl_safe._checks import check_count, check_number, check_shape
 from torchrl_safe.objectives.common import CriticCostLoss, Steps
 from torchrl_safe.objectives.distribution import (
     calibration_scales,
+    calibration_slope,
     cvar_distortion,
     draw_from_quantiles,
     quantile_loss,
@@ -31,6 +32,7 @@ from torchrl_safe.objectives.distribution import (
     rescale_quantiles,
     spectral_risk,
     spectral_weights,
+    stretch_quantiles,
 )
 from torchrl_safe.objectives.functional import check_regression
 from torchrl_safe.objectives.value import (
@@ -165,6 +167,7 @@ class QuantileCostLoss(CriticCostLoss):
     cost_network_params: TensorDictParams
     target_cost_network_params: TensorDictParams
     scales: Tensor
+    stretch: Tensor
 
     def __init__(
         self,
@@ -209,6 +212,7 @@ class QuantileCostLoss(CriticCostLoss):
             use_prioritized_weights=use_prioritized_weights,
         )
         self.register_buffer("scales", torch.ones(2, device=self._default_device))
+        self.register_buffer("stretch", torch.tensor([0.0, 1.0], device=self._default_device))
         self.out_keys = ["loss_cost_quantiles", "cost_value", "cost_std"]
         self.distortion = distortion
         self.level = level
@@ -330,7 +334,9 @@ class QuantileCostLoss(CriticCostLoss):
         )
 
     @torch.no_grad()
-    def recalibrate(self, tensordict: TensorDictBase, *, rate: float = 1.0) -> TensorDict:
+    def recalibrate(
+        self, tensordict: TensorDictBase, *, rate: float = 1.0, stretch: bool = False
+    ) -> TensorDict:
         """Measure how wrong predictions are where networks have not learned, and rescale them.
 
         The steps must say which networks learn from them, under ``"learned_by"``: those that do
@@ -344,6 +350,10 @@ class QuantileCostLoss(CriticCostLoss):
 
         Keyword Args:
             rate (float): how far the scales move to what was measured, in (0, 1]. Defaults to 1.
+            stretch (bool): measure, too, whether good states are judged too high and bad ones too
+                low, or the other way round, and set :attr:`stretch` accordingly
+                (:func:`~torchrl_safe.objectives.distribution.calibration_slope`). It takes the
+                outcomes of hundreds of episodes to tell. Defaults to ``False``.
 
         Returns:
             TensorDict of scalars: ``predicted_mean``, ``realised_mean``, ``predicted_risk`` and
@@ -370,7 +380,7 @@ class QuantileCostLoss(CriticCostLoss):
         raw = (quantiles * share.unsqueeze(-1)).sum(0)[some]
         sums = sums[some].to(raw)
         weights = self._weights(raw)
-        predicted = rescale_quantiles(raw, *self.scales)
+        predicted = self._rescaled(raw)
         report = TensorDict(
             predicted_mean=predicted.mean(),
             realised_mean=sums.mean(),
@@ -378,7 +388,10 @@ class QuantileCostLoss(CriticCostLoss):
             realised_risk=realised_risk(sums, predicted, weights).mean(),
         )
         if all(value.isfinite() for value in report.values()):
-            measured = torch.tensor(calibration_scales(raw, sums, weights)).to(self.scales)
+            if stretch:
+                self.stretch.copy_(torch.tensor(calibration_slope(raw, sums, weights)))
+            stretched = stretch_quantiles(raw, *self.stretch)
+            measured = torch.tensor(calibration_scales(stretched, sums, weights)).to(self.scales)
             self.scales.lerp_(measured, rate)
         return report
 
@@ -558,12 +571,15 @@ class QuantileCostLoss(CriticCostLoss):
 
     def _risk(self, quantiles: Tensor) -> Tensor:
         """Risk of the quantiles of every network ``[E, *B, N]``, with the pessimism, ``[*B]``."""
-        risk = spectral_risk(rescale_quantiles(quantiles, *self.scales), self._weights(quantiles))
+        risk = spectral_risk(self._rescaled(quantiles), self._weights(quantiles))
         return risk.mean(0) + self.pessimism * _std(risk, 0)
 
     def _judged(self, quantiles: Tensor) -> Tensor:
         """What the networks ``[E, *B, N]`` say together, rescaled, ``[*B, N]``."""
-        return rescale_quantiles(_average(quantiles), *self.scales)
+        return self._rescaled(_average(quantiles))
+
+    def _rescaled(self, quantiles: Tensor) -> Tensor:
+        return rescale_quantiles(stretch_quantiles(quantiles, *self.stretch), *self.scales)
 
     def _learned_by(self, tensordict: TensorDictBase, quantiles: Tensor) -> Tensor | None:
         """Whether each network learns from a step, as numbers ``[E, *B]``, if the data say so."""

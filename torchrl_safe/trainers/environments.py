@@ -265,10 +265,10 @@ def _batched(make: MakeEnv, num_envs: int, seed: int, options: MethodOptions) ->
         env = make(**how)
     else:
         env = make()
-        if not env.batch_size:
-            _check_episode(env, options)
-            env.close()
-            env = SerialEnv(num_envs, make)
+    _check_episode(env, options)
+    if "num_envs" not in takes and not env.batch_size:
+        env.close()
+        env = SerialEnv(num_envs, make)
     if "seed" not in takes or "num_envs" not in takes:
         env.set_seed(seed % 2**31)
     if len(env.batch_size) != 1:
@@ -284,7 +284,7 @@ def _check_episode(env: EnvBase, options: MethodOptions) -> None:
         return
     steps, longest = options.eval.num_steps, _time_limit(env)
     if longest is not None and steps > longest:
-        env.close()
+        env.close(raise_if_closed=False)  # one that has not begun counts as closed
         raise ValueError(
             f"eval.num_steps must be at most {longest}, the length of the environment's episodes, "
             f"for loss.limit_unit=episode, got {steps}."
@@ -293,6 +293,8 @@ def _check_episode(env: EnvBase, options: MethodOptions) -> None:
 
 def _time_limit(env: EnvBase) -> int | None:
     """The steps after which an environment truncates its episodes, where it tells."""
+    from torchrl_safe.envs._batched import BatchedEnv
+
     limits = []
     while isinstance(env, TransformedEnv):
         transform = env.transform
@@ -301,6 +303,17 @@ def _time_limit(env: EnvBase) -> int | None:
         env = env.base_env
     if isinstance(env, GymWrapper):
         limits.append(getattr(env.spec, "max_episode_steps", None))
+    elif isinstance(env, BatchedEnv):
+        limits.append(env.episode_length)
+    elif isinstance(env, BatchedEnvBase):
+        kinds: list[tuple[Any, Any]] = []  # mostly one: each is made once, not each environment
+        for kind in zip(env.create_env_fn, env.create_env_kwargs, strict=True):
+            if kind not in kinds:
+                kinds.append(kind)
+        for make, kwargs in kinds:
+            single = make(**kwargs)
+            limits.append(_time_limit(single))
+            single.close()
     return min((limit for limit in limits if limit is not None), default=None)
 
 

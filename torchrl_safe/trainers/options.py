@@ -155,7 +155,7 @@ class Env(Group):
         ge=1,
     )
     episode_length: int = option(
-        250, "steps, in training only: evaluation episodes have eval.num_steps", ge=1
+        125, "steps, in training only: evaluation episodes have eval.num_steps", ge=1
     )
     randomization: str | None = option(
         None, "of mass, friction and so on, in training only; of env=robot", choices=RANDOMIZATIONS

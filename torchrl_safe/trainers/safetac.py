@@ -209,6 +209,11 @@ class SafeTAC(ConstrainedTrainer):
             step = self._step if self.options.update == "trust_region" else self._ascend
             return step(batch, metrics)
 
+    def hand_over(self) -> dict[str, float]:
+        """Predictions rescaled by new episodes of the last policy."""
+        metrics = {} if self.cost_sums is None else self.cost_sums.calibrate()
+        return {f"final/{name}": value for name, value in metrics.items()}
+
     def _step(self, batch: TensorDictBase, metrics: dict[str, float]) -> dict[str, float]:
         """The trust region's step, (13), to limits that make up for where it ends above them."""
         optim, limits = self.options.optim, self.limits()

@@ -21,6 +21,7 @@ def stream_seed(name: str, *numbers: int) -> int:
     ``training``              seed, frames done before    environments, of each resumption its own
     ``worker``                seed of the above, worker   environments and noise of one process
     ``gait``                  seed                        the search of ``doggo_controller.py``
+    ``calibration``           seed                        the safety critic, at the end of training
     ``evaluation``            none: equal for all runs    evaluations during training
     ``final evaluation``      none: equal for all runs    the evaluation at the end
     ``evaluate.py``           its ``--seed``              evaluations afterwards

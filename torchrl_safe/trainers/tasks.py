@@ -4,14 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from torchrl_safe.envs.tasks import (
-    SAFETY_TASKS,
-    TASKS,
-    SafetyButtonTask,
-    SafetyGoalTask,
-    SafetyPushTask,
-    get_task,
-)
+from torchrl_safe.envs.tasks import SAFETY_TASKS, TASKS, get_task
 from torchrl_safe.envs.tasks.velocity import VELOCITY_TASKS, VelocityTask
 
 RUNNERS: dict[str, VelocityTask] = {
@@ -24,17 +17,14 @@ NAMES = (*TASKS, *SAFETY_TASKS, *RUNNERS)
 COST_LIMIT = 25.0  # the mean cost of an episode that the field allows, in every task
 RUNNERS_EPISODE = 1000  # steps
 
-# A reached goal moves and the episode goes on: it may be trained on in pieces, of more layouts.
-ENDLESS = (SafetyGoalTask, SafetyButtonTask, SafetyPushTask)
-
 
 def follows(task: str | None) -> dict[str, Any]:
     """What other options are by default where ``env.task`` is one of Safety-Gymnasium's.
 
     Its problem is the field's: the mean cost of an episode of the task's own length is at most 25.
-    A mean is a CVaR at risk level 1. Where goals move on, training keeps the shorter episodes of
-    ``env.episode_length``: with them the goal task was learned sooner
-    (docs/experiments.md, "Environments and episodes").
+    A mean is a CVaR at risk level 1. Training episodes are the task's, too: an episode begins in
+    the clear, so that pieces of it cost less than the whole, and a limit that holds in them does
+    not hold in the task (docs/experiments.md, 2026-11-28).
 
     Args:
         task (str, optional): the task's name.
@@ -52,14 +42,14 @@ def follows(task: str | None) -> dict[str, Any]:
     """
     if task in SAFETY_TASKS:
         _, navigation = get_task(task)
-        steps, endless = navigation.episode_length, isinstance(navigation, ENDLESS)
+        steps = navigation.episode_length
     elif task in RUNNERS:
-        steps, endless = RUNNERS_EPISODE, False
+        steps = RUNNERS_EPISODE
     else:
         return {}
     return {
         "env.robot": None,  # the task has its own
-        **({} if endless else {"env.episode_length": steps}),
+        "env.episode_length": steps,
         "loss.cost_limit": COST_LIMIT,
         "loss.limit_unit": "episode",
         "loss.risk_level": 1.0,

@@ -89,7 +89,7 @@ class Trainer(ABC):
                 named = dict.fromkeys(WIDTHS, width) | named
         options = self.Options() if options is None else options
         self.options: Any = options.changed(**named)
-        self._width = width
+        self.width = width
         self.in_keys = list(in_keys)
         self.network = network
         self.run: Run | None = None
@@ -109,6 +109,14 @@ class Trainer(ABC):
         Returns:
             dict: metrics to log.
         """
+
+    def hand_over(self) -> dict[str, float]:
+        """What is left to do when the policy learns no more, before it is saved.
+
+        Returns:
+            dict: metrics to log.
+        """
+        return {}
 
     @property
     def frames(self) -> int:
@@ -161,10 +169,10 @@ class Trainer(ABC):
         """
         options: Any = self.options.changed(**named)
         values = dict(flat(options))
-        for name in WIDTHS if self._width is not None else ():
-            if values[name] != self._width:
+        for name in WIDTHS if self.width is not None else ():
+            if values[name] != self.width:
                 raise ValueError(
-                    f"{name} must be {self._width}, the batch of env, got {values[name]}; a "
+                    f"{name} must be {self.width}, the batch of env, got {values[name]}; a "
                     "function that makes environments of num_envs and seed can have any."
                 )
         with Run(options) as run, threads(run.options):
@@ -202,6 +210,8 @@ class Trainer(ABC):
                 # None is left of a run that was killed in its final evaluation.
                 if run.frames_left:
                     self._loop(run, collector, eval_env, stop)
+                    if not run.frames_left:
+                        run.log(self.hand_over())
             except WorkerDied:
                 # A signal to the whole group of processes ends the workers, too. Everything learned
                 # is in this process: nothing of it is lost.
@@ -218,7 +228,7 @@ class Trainer(ABC):
         run.finish(final_env, self.policy)
         final_env.close(raise_if_closed=False)
         if options.video.num_steps:  # of one, as those of others draw all of a batch
-            run.film(partial(self.make_env, self._width or 1, seed), self.policy)
+            run.film(partial(self.make_env, self.width or 1, seed), self.policy)
         run.report()
 
     def _loop(

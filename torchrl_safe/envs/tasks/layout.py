@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -10,8 +12,11 @@ from torchrl_safe.envs.robots import Array
 from torchrl_safe.envs.tasks.base import length
 
 _ATTEMPTS = 2000  # layouts started before giving up
-_AT_ONCE = 16  # most attempts that are made at once for an environment
-_FIRST = 6  # candidates looked at first: mostly one of them will do
+_AT_ONCE = 512  # attempts that are made at once, or one for each environment
+_FIRST, _SECOND = 6, 24  # candidates looked at first and then: mostly one of them will do
+_BLOCK = 32_768  # candidates compared at once: they stay in the processor's cache
+_FEW = 5  # discs that a candidate is compared with first: mostly it is too near to one of them
+_SMALL = 8192  # comparisons that are not worth such care
 _GOAL_CANDIDATES = 256  # positions tried for one that moves during an episode
 
 
@@ -44,7 +49,7 @@ def scatter(
     count, half = len(keepout), extent - keepout
     if half.min() < 0.0:
         raise ValueError(f"a keepout of {keepout.max()} does not fit an extent of {extent}.")
-    layout = np.empty((len(rows), count), complex)
+    layout = np.empty((len(rows), count, 2))
     pending, made, at_once = np.arange(len(rows)), 0, 1
     numbers = 2 * count * candidates  # of one attempt, whether it needs them or not
     while made < _ATTEMPTS:
@@ -52,14 +57,16 @@ def scatter(
         attempt = np.tile(np.arange(at_once), len(pending))
         placed, legal = _attempt(keepout, half, streams, rows[owner], attempt * numbers, candidates)
         # The first legal attempt counts, as if each had waited for the one before it.
-        found, first = np.unique(owner[legal], return_index=True)
-        layout[found] = placed[legal[first]]
-        streams.skip(rows[found], (attempt[legal[first]] + 1) * numbers)
-        pending = np.setdiff1d(pending, found, assume_unique=True)
+        whose = owner[legal]
+        first = legal[np.append(True, whose[1:] != whose[:-1])[: len(whose)]]
+        found = owner[first]
+        layout[found] = placed[:, :, first].T
+        streams.skip(rows[found], (attempt[first] + 1) * numbers)
+        pending = _without(pending, found, len(rows))
         if not pending.size:
-            return layout.view(float).reshape(-1, count, 2)
+            return layout
         streams.skip(rows[pending], at_once * numbers)
-        made, at_once = made + at_once, min(2 * at_once, _AT_ONCE)
+        made, at_once = made + at_once, max(1, min(4 * at_once, _AT_ONCE // len(pending)))
     raise ValueError(
         f"no legal layout found in {_ATTEMPTS} attempts for {count} objects in an extent of "
         f"{extent}: use fewer hazards or other objects, smaller keepouts or a larger extent."
@@ -73,26 +80,79 @@ def _attempt(
     rows: NDArray[np.integer],
     ahead: NDArray[np.integer],
     candidates: int,
-) -> tuple[NDArray[np.complex128], NDArray[np.intp]]:
-    """Layouts [n, K] as complex numbers, of the numbers ``ahead`` [n], and which are legal."""
-    # A distance of complex numbers is one absolute value.
-    placed = np.empty((len(rows), len(keepout)), complex)
+) -> tuple[Array, NDArray[np.intp]]:
+    """Layouts [2, K, n] of the numbers ``ahead`` [n], and which of them are legal."""
+    objects = np.arange(len(keepout))
+    placed = np.empty((2, len(keepout), len(rows)))
+
+    def draw(which: NDArray[np.integer], start: int, end: int, some: NDArray[np.integer]) -> Array:
+        """Candidates [2, k, c, n] of the objects ``which`` in some of the attempts."""
+        number = 2 * (which[:, None] * candidates + np.arange(start, end))
+        places = streams.peek(rows[some], np.stack((number, number + 1))[..., None], ahead[some])
+        places *= 2.0
+        places -= 1.0
+        places *= half[which, None, None]
+        return places
+
+    def settle(j: int, places: Array, some: NDArray[np.integer]) -> NDArray[np.integer]:
+        """Puts an object on the first legal one of the places [2, c, n]; who has none is left."""
+        others = placed[:, :j] if len(some) == len(rows) else placed[:, :j].take(some, -1)
+        free = _clear(places, others, keepout[j] + keepout[:j])
+        first, each = free.argmax(0), np.arange(len(some))
+        found = free[first, each]
+        placed[:, j, some] = places[:, first, each]
+        return some[~found]
+
     legal = np.arange(len(rows))
+    at_first = draw(objects, 0, _FIRST, legal)
     for j in range(len(keepout)):
-        nowhere = legal
-        for start, end in ((0, _FIRST), (_FIRST, candidates)):
-            skipped = ahead[nowhere] + 2 * (j * candidates + start)
-            draws = streams.peek(rows[nowhere], skipped, 2 * (end - start)) * 2.0 - 1.0
-            places = draws.view(complex) * half[j]
-            distance = np.abs(places[:, :, None] - placed[nowhere, None, :j])
-            free = (distance >= keepout[j] + keepout[:j]).all(-1)
-            found = free.any(-1)
-            placed[nowhere[found], j] = places[found, free[found].argmax(-1)]
-            nowhere = nowhere[~found]
-            if not nowhere.size:
-                break
-        legal = np.setdiff1d(legal, nowhere, assume_unique=True)
+        nowhere = settle(j, at_first[:, j].take(legal, -1), legal)
+        if not nowhere.size:
+            continue
+        for start, end in pairwise((_FIRST, _SECOND, candidates)):
+            ends = range(_BLOCK // (end - start), len(nowhere), _BLOCK // (end - start))
+            parts = np.split(nowhere, ends)
+            left = [settle(j, draw(objects[[j]], start, end, part)[:, 0], part) for part in parts]
+            nowhere = np.concatenate(left)
+        legal = _without(legal, nowhere, len(rows))
     return placed, legal
+
+
+def _without(
+    some: NDArray[np.integer], others: NDArray[np.integer], count: int
+) -> NDArray[np.intp]:
+    """Those of some numbers below ``count`` that are not among others."""
+    left = np.zeros(count, bool)
+    left[some] = True
+    left[others] = False
+    return np.flatnonzero(left)
+
+
+def _clear(places: Array, others: Array, gaps: Array) -> NDArray[np.bool_]:
+    """Which of the places [2, c, n] are as far as ``gaps`` [K] from the others [2, K, n]."""
+    gaps = gaps**2
+    if len(gaps) * places.size < _SMALL:
+        return _apart(places, others[:, :, None], gaps[:, None, None])
+    # Those that keep most away come first: they leave few candidates to the others.
+    order = np.argsort(-gaps, kind="stable")
+    few, rest = order[:_FEW], order[_FEW:]
+    free = _apart(places, others[:, few, None], gaps[few, None, None])
+    if rest.size:
+        where = np.flatnonzero(free)
+        left = places.reshape(2, -1).take(where, -1)
+        others = others[:, rest].take(where % free.shape[1], -1)
+        free.reshape(-1)[where] = _apart(left, others, gaps[rest, None])
+    return free
+
+
+def _apart(places: Array, others: Array, gaps: Array) -> NDArray[np.bool_]:
+    """Which of the places [2, ...] are far enough from all others [2, K, ...]."""
+    square, other = others - places[:, None]
+    # In place: memory that is asked for anew costs more than the arithmetic.
+    square *= square
+    other *= other
+    square += other
+    return np.asarray((square >= gaps).all(0))
 
 
 def place_goal(
@@ -122,7 +182,7 @@ def place_goal(
     goal = np.empty((len(rows), 2))
     nowhere = np.arange(len(rows))
     for count in (_FIRST, _GOAL_CANDIDATES):
-        draws = streams.peek(rows[nowhere], np.zeros(len(nowhere), np.int64), 2 * count)
+        draws = streams.peek(rows[nowhere, None], np.arange(2 * count))
         places = (draws.reshape(-1, count, 2) * 2.0 - 1.0) * (extent - keepout)
         gaps = length(places[:, :, None] - others[nowhere, None]) - other_keepouts
         clearance = gaps.min(-1)

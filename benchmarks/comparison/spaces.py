@@ -113,6 +113,10 @@ RANGES: dict[str, Range] = {
     "optim.damping": LogUniform(0.01, 0.3),
     "optim.recovery_ratio": Choice((0.5, 0.7, 1.0)),
     "loss.clip_epsilon": Choice((0.1, 0.2, 0.3)),
+    "loss.kl_weight": LogUniform(0.5, 5.0),
+    "loss.penalty": LogUniform(3.0, 100.0),
+    "loss.tolerance": Choice((0.0, 0.25, 0.5)),
+    "policy.noise": LogUniform(0.05, 0.4),
     # The limit: where it is, how it comes down, what corrects it.
     "loss.initial_cost_limit": Per("loss.cost_limit", Choice((1.0, 1.5, 3.0))),
     "loss.anneal_frames": Per("collector.total_frames", Choice((0.25, 0.5))),
@@ -123,6 +127,9 @@ RANGES: dict[str, Range] = {
     "pid.kp": LogUniform(0.01, 0.3),
     "pid.ki": LogUniform(0.003, 0.1),
     "pid.kd": Choice((0.0, 0.05, 0.2)),
+    # What a step costs once the budget is spent.
+    "budget.unsafe_reward": Uniform(-2.0, 0.0),
+    "budget.termination_reward": Uniform(-5.0, 0.0),
 }
 
 UNUSED = {"safetac": ("lagrangian.", "pid.")}
@@ -193,6 +200,14 @@ def word(name: str, value: Any) -> str:
     return f"{name}={value if isinstance(value, str) else json.dumps(value)}"
 
 
+def shortest(rows: Sequence[str]) -> str:
+    """Names of some lines of the comparison, or of those that are missing where these are fewer."""
+    others = [name for name in ROWS if name not in rows]
+    if len(others) < len(rows):
+        return f"all but {', '.join(others)}" if others else "all"
+    return ", ".join(rows)
+
+
 def tables() -> str:
     """The ranges, and who has which, in Markdown."""
     owners = {
@@ -200,16 +215,14 @@ def tables() -> str:
         for name in ("loss.cost_limit", *RANGES)
     }
     lines = ["| Option | Range | Of |", "|---|---|---|"]
-    everybody = list(ROWS)
     for name, rows in owners.items():
         ranges = {str(ROWS[row].space[name]): None for row in rows}
         if len(ranges) > 1:  # the limit: on the mean, or on the CVaR
             for each in ranges:
                 own = [row for row in rows if str(ROWS[row].space[name]) == each]
-                lines.append(f"| `{name}` | {each} | {', '.join(own)} |")
+                lines.append(f"| `{name}` | {each} | {shortest(own)} |")
         else:
-            of = "all" if rows == everybody else ", ".join(rows)
-            lines.append(f"| `{name}` | {next(iter(ranges))} | {of} |")
+            lines.append(f"| `{name}` | {next(iter(ranges))} | {shortest(rows)} |")
     lines += ["", "| Line | Trained as |", "|---|---|"]
     for name, row in ROWS.items():
         words = " ".join([row.method, *(word(*each) for each in row.fixed)])

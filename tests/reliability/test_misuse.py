@@ -1629,6 +1629,7 @@ IMPOSSIBLE = {
     "env.robot": ("unicycle", "'point'"),
     "env.num_envs": (0, "at least 1"),
     "env.episode_length": (0, "at least 1"),
+    "env.standardize_frames": (-1, "at least 0"),
     "env.randomization": ("rain", "null or one of 'jackal_training'"),
     "task.top_speed": (0.0, "(0, inf)"),
     "task.tilt_cost": (-1.0, "[0, inf)"),

@@ -157,6 +157,14 @@ class Env(Group):
     episode_length: int = option(
         125, "steps, in training only: evaluation episodes have eval.num_steps", ge=1
     )
+    standardize_frames: int = option(
+        0,
+        "random steps before training, on top of its frames: networks standardise observations "
+        "with their mean and deviation; 0 for none",
+        ge=0,
+        le=FRAMES,
+        fixed=True,
+    )
     randomization: str | None = option(
         None, "of mass, friction and so on, in training only; of env=robot", choices=RANDOMIZATIONS
     )

@@ -20,6 +20,7 @@ def stream_seed(name: str, *numbers: int) -> int:
     ``networks``              seed                        weights, and the noise of this process
     ``training``              seed, frames done before    environments, of each resumption its own
     ``worker``                seed of the above, worker   environments and noise of one process
+    ``standardization``       seed                        environments of ``standardize_frames``
     ``gait``                  seed                        the search of ``doggo_controller.py``
     ``calibration``           seed                        the safety critic, at the end of training
     ``evaluation``            none: equal for all runs    evaluations during training

@@ -25,7 +25,14 @@ from torchrl_safe.optim.trust_region import TrustRegionReport
 from torchrl_safe.record import batch_metrics, count_violations
 from torchrl_safe.trainers.collectors import WorkerDied, make_collector
 from torchrl_safe.trainers.environments import cost_names, has_state, make_env, source_of
-from torchrl_safe.trainers.networks import MakeNetwork, is_discrete, make_critic, make_policy
+from torchrl_safe.trainers.networks import (
+    MakeNetwork,
+    Scale,
+    is_discrete,
+    make_critic,
+    make_policy,
+    scale_of,
+)
 from torchrl_safe.trainers.options import ConstrainedLoss, MethodOptions, flat, per_episode
 from torchrl_safe.trainers.run import Run
 from torchrl_safe.trainers.streams import stream_seed
@@ -92,6 +99,7 @@ class Trainer(ABC):
         self.width = width
         self.in_keys = list(in_keys)
         self.network = network
+        self.scales: dict[str, Scale] | None = None
         self.run: Run | None = None
 
     @abstractmethod
@@ -138,7 +146,9 @@ class Trainer(ABC):
                 f"{type(self).__name__} needs continuous actions, because it differentiates "
                 f"through them; the environment's are {type(env.action_spec).__name__}."
             )
-        return make_policy(self.options, env, in_keys=self.in_keys, network=self.network)
+        return make_policy(
+            self.options, env, in_keys=self.in_keys, network=self.network, scales=self.scales
+        )
 
     def make_critic(self, env: EnvBase, out_key: str, *last: nn.Module, **how: Any) -> Any:
         """A critic, see :func:`~torchrl_safe.trainers.networks.make_critic`."""
@@ -150,7 +160,21 @@ class Trainer(ABC):
             **how,
             in_keys=self.in_keys,
             network=self.network,
+            scales=self.scales,
         )
+
+    def measure_scales(self) -> dict[str, Scale]:
+        """Where observations lie, by key, from ``env.standardize_frames`` random steps."""
+        options, seed = self.options.env, stream_seed("standardization", self.options.seed)
+        frames = options.standardize_frames
+        whole = -(-frames // options.episode_length)  # episodes
+        num_envs = self.width or min(options.num_envs, whole)
+        env = self.make_env(num_envs, seed, training=True)
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(seed)
+            data = env.rollout(-(-frames // num_envs), break_when_any_done=False)
+        env.close(raise_if_closed=False)
+        return {key: scale_of(data[key]) for key in self.in_keys}
 
     def train(self, **named: Any) -> Any:
         """Train, evaluate and film, in a run's folder.
@@ -178,6 +202,8 @@ class Trainer(ABC):
         with Run(options) as run, threads(run.options):
             self.run, self.options = run, run.options
             set_up(self.options)
+            if self.options.env.standardize_frames:
+                self.scales = self.measure_scales()
             eval_env = self.make_env(self.options.eval.num_episodes, stream_seed("evaluation"))
             run.register(**self.build(eval_env))
             self._train(run, eval_env)

@@ -93,9 +93,8 @@ OMNISAFE_ON_POLICY: Values = {
     "loss.lmbda": (0.95, "lam, lam_c"),
     "optim.max_grad_norm": (40.0, "max_grad_norm"),
 }
-OMNISAFE_PPO: Values = {
+OMNISAFE_PPO_STEPS: Values = {
     **OMNISAFE_ON_POLICY,
-    "loss.clip_epsilon": (0.2, "clip"),
     "optim.critic_lr": (3e-4, "critic lr"),
     "optim.critic_rounds": (40, "update_iters"),
     "optim.minibatch_size": (64, "batch_size"),
@@ -103,6 +102,7 @@ OMNISAFE_PPO: Values = {
     "optim.num_epochs": (40, "update_iters"),
     "optim.max_kl": (0.02, "target_kl"),
 }
+OMNISAFE_PPO: Values = {**OMNISAFE_PPO_STEPS, "loss.clip_epsilon": (0.2, "clip")}
 OMNISAFE_TRUST_REGION: Values = {
     **OMNISAFE_ON_POLICY,
     "optim.critic_lr": (1e-3, "critic lr"),
@@ -141,6 +141,7 @@ OMNISAFE_DIFFERS = (
     "observations are standardised, weights of critics decay by 0.001, learning rates of PPO fall "
     "linearly, and critics' targets are computed once per batch."
 )
+OMNISAFE_CAPPED = "The multiplier is 2 at most."
 OMNISAFE_PID_DIFFERS = (
     f"{OMNISAFE_DIFFERS} The controller's error is smoothed, its derivative over ten batches."
 )
@@ -193,7 +194,12 @@ PUBLISHED: dict[str, dict[str, Published]] = {
         ),
         "omnisafe": Published(
             f"{OMNISAFE}/on-policy/CPO.yaml",
-            OMNISAFE_TRUST_REGION | STILL | {"optim.recovery_ratio": (1.0, "optim_case 0")},
+            {
+                **OMNISAFE_TRUST_REGION,
+                **STILL,
+                "optim.max_backtracks": (19, "total_steps, the first candidate included"),
+                "optim.recovery_ratio": (1.0, "optim_case 0"),
+            },
             OMNISAFE_DIFFERS,
         ),
     },
@@ -276,6 +282,61 @@ PUBLISHED: dict[str, dict[str, Published]] = {
             f"{OMNISAFE}/on-policy/TRPOPID.yaml",
             {**OMNISAFE_TRUST_REGION, **OMNISAFE_PID},
             OMNISAFE_PID_DIFFERS,
+        ),
+    },
+    "focops": {
+        "omnisafe": Published(
+            f"{OMNISAFE}/on-policy/FOCOPS.yaml",
+            {
+                **OMNISAFE_PPO_STEPS,
+                "loss.kl_weight": (1.5, "focops_lam"),
+                "optim.max_kl": (0.02, "target_kl, focops_eta"),
+                **OMNISAFE_MULTIPLIER,
+            },
+            f"{OMNISAFE_DIFFERS} {OMNISAFE_CAPPED}",
+        ),
+    },
+    "cup": {
+        "omnisafe": Published(
+            f"{OMNISAFE}/on-policy/CUP.yaml",
+            {**OMNISAFE_PPO, "optim.max_kl": (0.01, "target_kl"), **OMNISAFE_MULTIPLIER},
+            f"{OMNISAFE_DIFFERS} {OMNISAFE_CAPPED}",
+        ),
+    },
+    "p3o": {
+        "omnisafe": Published(
+            f"{OMNISAFE}/on-policy/P3O.yaml",
+            {
+                **OMNISAFE_PPO,
+                **STILL,
+                "optim.critic_rounds": (10, "update_iters"),
+                "optim.num_epochs": (10, "update_iters"),
+                "loss.penalty": (20.0, "kappa"),
+            },
+            f"{OMNISAFE_DIFFERS} The penalty is on the excess of a whole episode beside the "
+            "advantage of a step; here both are of a step.",
+        ),
+    },
+    "crpo": {
+        "omnisafe": Published(
+            f"{OMNISAFE}/on-policy/OnCRPO.yaml",
+            {
+                **OMNISAFE_TRUST_REGION,
+                **STILL,
+                "loss.tolerance": (0.2, "distance 2, of an episode's cost"),
+            },
+            OMNISAFE_DIFFERS,
+        ),
+    },
+    "pcpo": {
+        "omnisafe": Published(
+            f"{OMNISAFE}/on-policy/PCPO.yaml",
+            {
+                **OMNISAFE_TRUST_REGION,
+                **STILL,
+                "optim.max_backtracks": (199, "total_steps, the first candidate included"),
+            },
+            OMNISAFE_DIFFERS,
         ),
     },
     "ppo_saute": {

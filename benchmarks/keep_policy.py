@@ -11,10 +11,10 @@ from __future__ import annotations
 
 import argparse
 import json
-import subprocess
 from functools import partial
 from pathlib import Path
 
+from keep_run import trained_at
 from torchrl.envs.utils import ExplorationType
 
 from torchrl_safe import policies
@@ -71,10 +71,8 @@ def keep_policy(run_dir: Path, path: Path, num_episodes: int = NUM_EPISODES) -> 
     policy, options = from_newest(
         run_dir, lambda options, checkpoint: (saved_policy(options, checkpoint, make), options)
     )
-    commit = subprocess.run(
-        ["git", "rev-parse", "HEAD"], capture_output=True, text=True, check=True
-    ).stdout.strip()
-    saved = SavedPolicy(policy, options, {"command": command(options), "commit": commit})
+    about = {"command": command(options), "commit": trained_at(run_dir)}
+    saved = SavedPolicy(policy, options, about)
     saved.about["figures"] = figures(saved, num_episodes, seed=0)
     write_policy(path, saved)
     if (size := path.stat().st_size) > LARGEST:

@@ -9,11 +9,12 @@ from __future__ import annotations
 
 import argparse
 import csv
+import json
 import shutil
-import subprocess
 from pathlib import Path
 
 from torchrl_safe.record import read_metrics
+from torchrl_safe.trainers.saved import HISTORY
 
 KEPT = ("train/", "eval/", "update/", "time/frames_per_second")
 
@@ -35,10 +36,13 @@ def keep_run(run_dir: Path, out_dir: Path) -> None:
     for name in ("config.yaml", "results.json"):
         if (run_dir / name).exists():
             shutil.copy(run_dir / name, out_dir / name)
-    commit = subprocess.run(
-        ["git", "rev-parse", "HEAD"], capture_output=True, text=True, check=True
-    ).stdout
-    (out_dir / "commit.txt").write_text(commit)
+    (out_dir / "commit.txt").write_text(f"{trained_at(run_dir)}\n")
+
+
+def trained_at(run_dir: Path) -> str:
+    """The commit that a run was last started from, which its history knows."""
+    last = (run_dir / HISTORY).read_text().splitlines()[-1]
+    return json.loads(last)["surroundings"]["commit"] or "unknown"
 
 
 if __name__ == "__main__":

@@ -36,6 +36,7 @@ from bench_training import SILENT
 
 from torchrl_safe.record import read_metrics
 from torchrl_safe.trainers import METHODS
+from torchrl_safe.trainers.surroundings import commit
 
 ROOT = Path(__file__).resolve().parents[1]
 RESULTS = ROOT / "benchmarks" / "results" / "time_to_score"
@@ -148,16 +149,13 @@ def summary(rows: list[Row], criteria: dict[str, float]) -> dict[str, Any]:
 def hardware() -> dict[str, Any]:
     lines = Path("/proc/cpuinfo").read_text().splitlines() if os.name == "posix" else []
     names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
-    commit = subprocess.run(
-        ["git", "rev-parse", "HEAD"], cwd=ROOT, capture_output=True, text=True, check=False
-    )
     return {
         "processor": names[0] if names else platform.processor(),
         "cores": os.cpu_count(),
         "load_average_before": os.getloadavg()[0],
         "python": platform.python_version(),
         "torch": version("torch"),
-        "commit": commit.stdout.strip(),
+        "commit": commit(),
     }
 
 

@@ -19,6 +19,7 @@ from torchrl_safe.trainers import cli, load_policy
 from torchrl_safe.trainers.commands import play
 from torchrl_safe.trainers.environments import UntrustedError
 from torchrl_safe.trainers.saved_policies import read_policy
+from torchrl_safe.trainers.surroundings import commit
 
 OVERRIDES = ("collector.total_frames=100", "loss.cost_limit=2.5", "policy.num_components=2")
 

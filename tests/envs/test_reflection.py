@@ -8,6 +8,7 @@ import torch
 from tensordict import TensorDict
 
 from torchrl_safe.envs import Reflection, SafeRobotEnv
+from torchrl_safe.envs.tasks import get_task
 
 
 def mirrored_world(state, nq, nv):
@@ -47,6 +48,94 @@ def test_point_drives_the_same_in_the_mirror():
         )
         if not same.all():
             break
+
+
+AXIAL = torch.tensor([1.0, -1.0, -1.0])  # what turns, in a mirror that faces east
+
+
+def turned_quaternion(quaternion):
+    """Of a box whose east is its west."""
+    return quaternion * torch.tensor([1.0, 1.0, -1.0, -1.0])
+
+
+def mirrored_point(position, velocity):
+    """East is west, and the robot's left its right."""
+    position[:, 0] *= -1
+    position[:, 2] = torch.pi - position[:, 2]
+    velocity[:, [0, 2]] *= -1
+
+
+def mirrored_car(position, velocity):
+    """The same of a free base, two wheels that change places, and a ball between them."""
+    position[:, 0] *= -1
+    w, x, y, z = position[:, 3:7].clone().T
+    position[:, 3:7] = torch.stack([z, -y, -x, w], 1)
+    position[:, 7:9] = position[:, 7:9].flip(1)
+    position[:, 9:13] *= torch.tensor([1.0, -1.0, 1.0, -1.0])
+    velocity[:, 0] *= -1
+    velocity[:, 3:6] *= torch.tensor([-1.0, 1.0, -1.0])
+    velocity[:, 6:8] = velocity[:, 6:8].flip(1)
+    velocity[:, 8:11] *= torch.tensor([-1.0, 1.0, -1.0])
+
+
+@pytest.mark.parametrize(
+    ("task", "own", "sizes"),
+    [
+        ("SafetyPointGoal1", mirrored_point, (3, 3)),
+        ("SafetyPointPush0", mirrored_point, (3, 3)),
+        ("SafetyCarGoal1", mirrored_car, (13, 11)),
+        ("SafetyCarGoal2", mirrored_car, (13, 11)),
+    ],
+)
+def test_safety_tasks_in_the_mirror(task, own, sizes):
+    """Sensors, lidars, reward and cost, with what can be pushed: east for west, since the magnetic
+    field points north."""
+    robot, of_robot = get_task(task)
+    env, other = (
+        SafeRobotEnv(robot, task=of_robot, num_envs=32, num_threads=1, seed=seed) for seed in (3, 4)
+    )
+    env.reset()
+    other.reset()
+    state = {name: value.clone() for name, value in env.state_dict().items()}
+    for name in ("position", "heading", "goal", "hazards", "vases", "push_box"):
+        if name in state:
+            state[name][..., 0] *= -1
+    movable = [body.count for body in of_robot.bodies if body.hold == "free"]
+    nq, nv = (first + each * sum(movable) for first, each in zip(sizes, (7, 6), strict=True))
+    position = state["physics"][:, 1 : 1 + nq]
+    velocity = state["physics"][:, 1 + nq : 1 + nq + nv]
+    own(position, velocity)
+    for start in range(sizes[0], nq, 7):
+        position[:, start] *= -1
+        position[:, start + 3 : start + 7] = turned_quaternion(position[:, start + 3 : start + 7])
+    for start in range(sizes[1], nv, 6):
+        velocity[:, start] *= -1
+        velocity[:, start + 3 : start + 6] *= AXIAL
+    other.load_state_dict(state)
+    mirror = env.reflection
+    generator = torch.Generator().manual_seed(0)
+    alike = torch.ones(32, dtype=torch.bool)  # until a new goal is drawn, by another stream
+    for _ in range(20):
+        action = 2 * torch.rand(32, 2, generator=generator) - 1
+        step = env.step(TensorDict(action=action, batch_size=[32]))
+        seen = mirror(TensorDict(observation=step["next", "observation"], action=action))
+        there = other.step(TensorDict(action=seen["action"], batch_size=[32]))["next"]
+        off = (there["observation"] - seen["observation"]).abs().amax(-1) > 0.02
+        for name in ("reward", "cost"):
+            off |= (there[name] - step["next", name]).squeeze(-1).abs() > 1e-3
+        alike &= ~step["next", "goal_met"].squeeze(-1)
+        # One that bumps into something may go either way: contacts blow rounding up.
+        assert (off & alike).sum() <= 2
+    assert alike.sum() > 20
+
+
+@pytest.mark.parametrize(
+    "task", ["SafetyPointButton1", "SafetyPointCircle1", "SafetyPointRun0", "SafetyAntGoal1"]
+)
+def test_tasks_without(task):
+    """Gremlins and Circle's reward go round one way, Run leads along one axis."""
+    robot, of_robot = get_task(task)
+    assert SafeRobotEnv(robot, task=of_robot, num_envs=1, num_threads=1).reflection is None
 
 
 @pytest.mark.parametrize("robot", ["point", "car", "jackal"])

@@ -93,6 +93,28 @@ def own_size(robot: Robot) -> int:
     return plain + 4 * shows.floating + 12 * len(shows.balls)
 
 
+def own_in_mirror(robot: Robot) -> list[int] | None:
+    """What becomes of what a robot shows of itself if its left is its right.
+
+    Vectors lose their sideways part's sign, what turns about an axis keeps that part's alone. The
+    magnetic field points north, and so does its image in a mirror that runs north.
+
+    Returns:
+        list of int: of P places, see :class:`~torchrl_safe.envs.Reflection`; None of a robot that
+        has no mirror image, or feels its joints or feet.
+    """
+    shows = robot.instruments
+    if robot.mirrored is None or shows.touch or shows.hinges or shows.floating:
+        return None
+    ahead_is_x = abs(np.cos(robot.frame_turn)) > abs(np.sin(robot.frame_turn))
+    vector = (1, -1, 1) if ahead_is_x else (-1, 1, 1)
+    turning = [-sign for sign in vector]
+    matrix = [row * column for row in vector for column in vector]
+    imu = [*vector, *vector, *turning, *vector]
+    signs = imu + turning * len(shows.balls) + matrix * len(shows.balls)
+    return [sign * place for place, sign in enumerate(signs, start=1)]
+
+
 def read_sensors(robot: Robot, bodies: Bodies, sensors: Array) -> Readings:
     """Takes apart what the sensors of a model with bodies read.
 

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchrl_safe.envs._random import RandomStreams
+from torchrl_safe.envs.reflection import Reflection
 from torchrl_safe.envs.robots import Array, Motion, Robot
 from torchrl_safe.envs.tasks.base import (
     Mask,
@@ -26,7 +27,14 @@ from torchrl_safe.envs.tasks.base import (
     length,
     lidar_readings,
 )
-from torchrl_safe.envs.tasks.bodies import Bodies, Body, Readings, own_size, read_sensors
+from torchrl_safe.envs.tasks.bodies import (
+    Bodies,
+    Body,
+    Readings,
+    own_in_mirror,
+    own_size,
+    read_sensors,
+)
 from torchrl_safe.envs.tasks.layout import place_goal, scatter
 
 _REWARD_CLIP = 10.0
@@ -74,6 +82,7 @@ class SafetyTask:
     lidar_bins: ClassVar[int] = 16
     lidar_range: ClassVar[float] = 3.0
     reward_clip: ClassVar[float] = _REWARD_CLIP
+    same_in_mirror: ClassVar[bool] = False  # whether left and right are alike to the task
 
     def __post_init__(self) -> None:
         if isinstance(self.level, bool) or self.level not in self.levels:
@@ -212,6 +221,18 @@ class SafetyTask:
             goal_met,
             terminated=readings.position[:, 2] <= robot.lowest,
         )
+
+    def reflection(self, robot: Robot) -> Reflection | None:
+        """What becomes of what is shown if left is right; None where something tells them apart."""
+        own, bins = own_in_mirror(robot), self.lidar_bins
+        if own is None or robot.mirrored is None or not self.same_in_mirror:
+            return None
+        # A direction at an angle t ahead of the sensors' x axis comes to -t, or to pi - t where the
+        # robot drives along their y axis.
+        last = bins if own[0] > 0 else bins // 2
+        scan = [(last - 1 - place) % bins for place in range(bins)]
+        shown = [len(own) + 1 + k * bins + place for k in range(len(self.kinds)) for place in scan]
+        return Reflection([*own, *shown], robot.mirrored[1])
 
     def observe(
         self, robot: Robot, motion: Motion, objects: Objects, scan: Array

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,6 +45,8 @@ class SafetyGoalTask(SafetyTask):
         >>> env.reset()["observation"].shape
         torch.Size([2, 60])
     """
+
+    same_in_mirror: ClassVar[bool] = True
 
     @property
     def extent(self) -> float:

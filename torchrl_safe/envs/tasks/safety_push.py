@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,6 +48,8 @@ class SafetyPushTask(SafetyTask):
 
     box_half_size: float = 0.2
     box_density: float = 0.001
+
+    same_in_mirror: ClassVar[bool] = True
 
     @property
     def extent(self) -> float:

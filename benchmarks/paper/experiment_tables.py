@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import csv
+import json
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from statistics import fmean
@@ -72,6 +73,12 @@ CRITICS = {
     "one_qvalue_two_passes_seed1": "seed 1",
 }
 RENEWALS = {"rounds2_lmbda0.97": "lambda .97", "rounds2_lmbda0": "lambda 0"}
+POINT_GOAL = {
+    "pieces_61": "125 steps",
+    "whole_61": "whole",
+    "standardized_71": "whole, observations standardised",
+    "standardized_mirror_71": "the same, with the mirror image",
+}
 LINEAGE = {
     "lineage_like_600k": "the lineage's setting",
     "../long/seed_0/curves": "400 environments, seed 0",
@@ -259,6 +266,26 @@ def retrace_sac() -> str:
     return table(["frames", "Retrace", "TD(0)"], rows)
 
 
+def point_goal() -> str:
+    """Runs on SafetyPointGoal1: how fast they learn, and where they end."""
+    rows = []
+    for name, title in POINT_GOAL.items():
+        folder = RESULTS / "point_goal1" / name
+        early = [
+            row["train/reward_per_1000"]
+            for row in curves(folder / "curves.csv")
+            if 100_000 < row["frames"] <= 200_000
+        ]
+        ends = json.loads((folder / "results.json").read_text())
+        sampled, certain = (
+            f"{ends[f'{kind}return']:.1f} / {ends[f'{kind}cost']:.1f}"
+            for kind in ("eval/", "eval/det/")
+        )
+        rows.append([title, f"{fmean(early):.1f}", sampled, certain])
+    head = ["episodes in training", "return at 100,000 to 200,000 frames", "return / cost", "det."]
+    return table(head, rows)
+
+
 PARTS: dict[str, Callable[[], str]] = {
     "log targets": lambda: windows(TARGETS),
     "log episodes": lambda: windows(EPISODES),
@@ -274,4 +301,5 @@ PARTS: dict[str, Callable[[], str]] = {
     "retrace sac": retrace_sac,
     "log soft draws": soft_draws,
     "log distances": distances,
+    "log point goal": point_goal,
 }

@@ -40,7 +40,9 @@ def keep_run(run_dir: Path, out_dir: Path) -> None:
 
 
 def trained_at(run_dir: Path) -> str:
-    """The commit that a run was last started from, which its history knows."""
+    """The commit that a run was last started from, which its history knows if it has one."""
+    if not (run_dir / HISTORY).exists():
+        return "unknown"
     last = (run_dir / HISTORY).read_text().splitlines()[-1]
     return json.loads(last)["surroundings"]["commit"] or "unknown"
 

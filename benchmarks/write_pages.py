@@ -25,10 +25,11 @@ from PIL import Image
 
 ROOT = Path(__file__).resolve().parents[1]
 RESULTS = ROOT / "benchmarks" / "results"
-sys.path[:0] = [str(ROOT / "benchmarks" / "paper"), str(ROOT / "benchmarks")]
+sys.path[:0] = [str(ROOT / "benchmarks" / folder) for folder in ("paper", "suite", ".")]
 from experiment_tables import PARTS as EXPERIMENT_PARTS  # noqa: E402
 from result_tables import PARTS as RESULT_PARTS  # noqa: E402
 from seed_statistics import interval, permutation  # noqa: E402
+from table import PUBLISHED, read_results  # noqa: E402
 
 PAGES = (
     "README.md",
@@ -40,7 +41,7 @@ PAGES = (
 )
 MARKED = re.compile(r"(<!-- generated: ([\w ]+) -->\n).*?(\n<!-- end -->)", re.DOTALL)
 LIMIT, FRAMES = 5, 1_000_000
-WORDS = {5: "five", 6: "six", 7: "seven", 8: "eight", 9: "nine", 10: "ten"}
+WORDS = {2: "two", 3: "three", 4: "four", 5: "five", 6: "six", 7: "seven", 8: "eight", 9: "nine", 10: "ten"}
 LEARNING = ROOT / "docs" / "images" / "learning.png"
 
 Row = dict[str, str]
@@ -118,6 +119,27 @@ def readme_speed() -> str:
     )
 
 
+def readme_record() -> str:
+    """The field's own task, beside the best of the published agents that learn as this one does."""
+    task, best = "SafetyPointGoal1", "TRPO-PID"
+    group = [
+        result
+        for result in read_results()
+        if (result["task"], result["method"], result["frames"]) == (task, "safetac", FRAMES)
+    ]
+    returned, cost = (
+        with_interval([statistics.fmean(each["episodes"]["sampled"][name]) for each in group], ".1f")
+        for name in ("return", "cost")
+    )
+    published = next(each for each in PUBLISHED[task] if each.by == best)
+    return wrap(
+        f"On Safety-Gymnasium's {task}, {WORDS.get(len(group), len(group))} seeds return {returned} "
+        f"at a cost of {cost} after the same number of frames. The field's limit is 25. The best "
+        f"published on-policy agent that keeps it, OmniSafe's {best}, returns {published.reward} at "
+        f"{published.cost}, after ten times the frames. [Records](docs/records.md) has the tasks."
+    )
+
+
 def pythons() -> str:
     """The Pythons of the package's classifiers."""
     project = (ROOT / "pyproject.toml").read_text()
@@ -138,6 +160,7 @@ PARTS: dict[str, Callable[[], str]] = {
     "readme results": readme_results,
     "readme table": lambda: safety_table(with_p=False),
     "readme speed": readme_speed,
+    "readme record": readme_record,
     "safety table": lambda: safety_table(with_p=True),
     **RESULT_PARTS,
     **EXPERIMENT_PARTS,

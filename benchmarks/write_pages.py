@@ -117,8 +117,9 @@ def readme_record() -> str:
     means = {name: [statistics.fmean(each[name]) for each in group] for name in ("return", "cost")}
     published = next(each for each in PUBLISHED[task] if each.by == best)
     returned, cost = (f"{statistics.fmean(values):.1f}" for values in means.values())
+    seeds = WORDS.get(len(group), str(len(group)))
     return wrap(
-        f"On Safety-Gymnasium's {task}, {WORDS.get(len(group), len(group))} seeds return {returned} "
+        f"On Safety-Gymnasium's {task}, {seeds} seeds return {returned} "
         f"at a cost of {cost}, after the same number of frames. The best published agent that "
         f"keeps the field's limit, OmniSafe's {best}, returns {published.reward}, after {share} "
         "times the frames. [Records](docs/records.md) has the intervals."

@@ -8,6 +8,7 @@ COMMON = [
     "num_threads=1",
     "env.num_envs=4",
     "env.episode_length=50",
+    "env.standardize_frames=0",  # of a task it would be longer than the run
     "collector.frames_per_batch=200",
     "collector.init_frames=0",
     "collector.total_frames=400",

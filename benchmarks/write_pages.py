@@ -118,11 +118,12 @@ def readme_record() -> str:
     published = next(each for each in PUBLISHED[task] if each.by == best)
     returned, cost = (f"{statistics.fmean(values):.1f}" for values in means.values())
     seeds = WORDS.get(len(group), str(len(group)))
+    cheaper = "lower" if published.cost < statistics.fmean(means["cost"]) else "higher"
     return wrap(
         f"On Safety-Gymnasium's {task}, {seeds} seeds return {returned} "
         f"at a cost of {cost}, after the same number of frames. The best published agent that "
-        f"keeps the field's limit, OmniSafe's {best}, returns {published.reward}, after {share} "
-        "times the frames. [Records](docs/records.md) has the intervals."
+        f"keeps the field's limit, OmniSafe's {best}, returns {published.reward} at a {cheaper} "
+        f"cost, after {share} times the frames. [Records](docs/records.md) has the intervals."
     )
 
 

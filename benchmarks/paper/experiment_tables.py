@@ -75,6 +75,8 @@ CRITICS = {
 RENEWALS = {"rounds2_lmbda0.97": "lambda .97", "rounds2_lmbda0": "lambda 0"}
 POINT_GOAL = {
     "pieces_61": "125 steps",
+    "pieces_limit_12_71": "125 steps, limit 12",
+    "pieces_250_limit_16_71": "250 steps, limit 16",
     "whole_61": "whole",
     "standardized_71": "whole, observations standardised",
     "standardized_mirror_71": "the same, with the mirror image",
